@@ -1,0 +1,1 @@
+"""Rotations, rigid motions, cameras, alignment, triangulation: no state, no I/O."""
