@@ -1,0 +1,1 @@
+"""Images to corners, descriptors and depths; and descriptors to matches."""

@@ -1,0 +1,1 @@
+"""The map and what keeps it: points, keyframes, places, loops, the file."""
