@@ -9,17 +9,18 @@ from lodelight.compiled import kernel
 from lodelight.types import Words
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _popcount(typing_context: Any, word: Any) -> Any:
-    """Number of set bits: one machine instruction (numba has no call for it)."""
-
+def _count_bits(typing_context: Any, word: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.ctpop(args[0])
 
     return types.uint64(types.uint64), codegen
 
 
+# One machine instruction; numba has no call for it.
+popcount: Any = intrinsic(_count_bits)
+
+
 @kernel
 def hamming(a: Words, b: Words) -> int:
     """Number of differing bits of two descriptors (4,) uint64."""
-    return int(_popcount(a[0] ^ b[0]) + _popcount(a[1] ^ b[1]) + _popcount(a[2] ^ b[2]) + _popcount(a[3] ^ b[3]))
+    return int(popcount(a[0] ^ b[0]) + popcount(a[1] ^ b[1]) + popcount(a[2] ^ b[2]) + popcount(a[3] ^ b[3]))

@@ -160,7 +160,7 @@ class Map:
         for row in rows:
             if int(f.keyframe[row]) not in seen_in:
                 seen_in.add(int(f.keyframe[row]))
-                self.link([row], [new])
+                self.link(np.array([row]), np.array([new]))
         p.n_visible[new] += p.n_visible[old]
         p.n_found[new] += p.n_found[old]
         p.alive[old] = False
