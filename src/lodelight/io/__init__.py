@@ -1,0 +1,1 @@
+"""Recordings, rigs and trajectories in and out: one file per format."""

@@ -1,0 +1,82 @@
+"""Time stamps: exact integers of nanoseconds, their order, and their association between sensors."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lodelight.types import Bools
+
+NS_PER_S = 1_000_000_000
+
+
+def ns_from_seconds(text: str) -> int:
+    """The nanoseconds a decimal text of seconds stands for, exactly (a float would lose 100 ns on a Unix time).
+
+    Raises ValueError where the text is no finite number.
+    """
+    whole, point, fraction = text.partition(".")
+    if point and whole.isdigit() and fraction.isdigit() and len(fraction) <= 9:
+        return int(whole) * NS_PER_S + int(fraction.ljust(9, "0"))
+    return ns_from_text(text, NS_PER_S)
+
+
+def ns_from_text(text: str, units_to_ns: int = 1) -> int:
+    """The nanoseconds of any decimal text, `1.4e18` included, rounded to the nearest."""
+    try:
+        return int((Decimal(text) * units_to_ns).to_integral_value())
+    except (InvalidOperation, OverflowError, ValueError):
+        raise ValueError(f"{text!r} is no time stamp") from None
+
+
+def seconds_text(t_ns: int) -> str:
+    """Seconds with nine decimals, exactly."""
+    whole, fraction = divmod(abs(t_ns), NS_PER_S)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{fraction:09d}"
+
+
+def increasing(t_ns: NDArray[np.int64]) -> Bools:
+    """Which of (N,) stamps to keep so that the kept ones strictly increase and the fewest are lost.
+
+    The longest increasing subsequence: one stamp that jumps ahead costs itself, not all that follow it.
+    """
+    tails: list[int] = []
+    ends: list[int] = []
+    before = np.full(len(t_ns), -1, dtype=np.int64)
+    for i, t in enumerate(t_ns.tolist()):
+        at = bisect_left(tails, t)
+        before[i] = ends[at - 1] if at else -1
+        tails[at : at + 1] = [t]
+        ends[at : at + 1] = [i]
+    keep = np.zeros(len(t_ns), dtype=np.bool_)
+    i = ends[-1] if ends else -1
+    while i >= 0:
+        keep[i] = True
+        i = int(before[i])
+    return keep
+
+
+def associate(t_a: NDArray[np.int64], t_b: NDArray[np.int64], tolerance_ns: int) -> NDArray[np.int64]:
+    """For each stamp of a the index of its partner in b, or -1; closest pairs first, each of b used once.
+
+    t_a, t_b : (N,), (M,) ns, in any order. Partners differ by no more than `tolerance_ns`.
+    """
+    partner = np.full(len(t_a), -1, dtype=np.int64)
+    order = np.argsort(t_b, kind="stable")
+    ordered = t_b[order]
+    low = np.searchsorted(ordered, t_a - tolerance_ns, "left")
+    high = np.searchsorted(ordered, t_a + tolerance_ns, "right")
+    pairs = [
+        (abs(int(ordered[k]) - int(t_a[i])), i, int(order[k]))
+        for i in range(len(t_a))
+        for k in range(int(low[i]), int(high[i]))
+    ]
+    taken: set[int] = set()
+    for _, i, j in sorted(pairs):
+        if partner[i] < 0 and j not in taken:
+            partner[i] = j
+            taken.add(j)
+    return partner
