@@ -1,3 +1,26 @@
 """Indoor visual SLAM and localization, anchored by the building itself."""
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lodelight.io.sources import open_source as open_source
+
 __version__ = "0.1.0"
+
+# Imported at first use, so that `import lodelight` costs nothing.
+_EXPORTS = {
+    "open_source": "lodelight.io.sources",
+}
+__all__ = ["__version__", *_EXPORTS]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module 'lodelight' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_EXPORTS[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lodelight.geometry.se3 import SE3
-from lodelight.types import Array
+from lodelight.types import AnyArray, Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,10 @@ class Trajectory:
     def pose(self, i: int) -> SE3:
         """T_world_body of row i."""
         return SE3.from_quat_xyzw(self.xyz[i], self.quat_xyzw[i])
+
+    def rows(self, index: AnyArray) -> Trajectory:
+        """The poses of some rows: indices in order, or a mask (N,)."""
+        return Trajectory(self.t_ns[index], self.xyz[index], self.quat_xyzw[index])
 
     @property
     def length_m(self) -> float:

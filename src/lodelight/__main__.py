@@ -1,0 +1,7 @@
+"""`python -m lodelight`."""
+
+import sys
+
+from lodelight.cli.main import main
+
+sys.exit(main())

@@ -1,0 +1,1 @@
+"""How far an estimated path lies from the true one."""

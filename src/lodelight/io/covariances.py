@@ -1,0 +1,39 @@
+"""`covariance.csv`: how sure each pose of a trajectory is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lodelight.errors import SourceError
+from lodelight.io.stamps import ns_from_text
+from lodelight.io.text import read_table, write_text
+from lodelight.types import Array
+
+AXES = ("rx", "ry", "rz", "px", "py", "pz")
+UPPER = np.triu_indices(6)
+NAMES = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=True))
+HEADER = (
+    "# upper triangle of each pose's 6x6 covariance: rotation (rad, body axes) first, then position (m, world axes)\n"
+    "# t_ns," + ",".join(NAMES) + "\n"
+)
+
+
+def write_covariances(path: Path, t_ns: list[int], covariances: list[Array]) -> None:
+    """Rows of t_ns and the 21 entries of each (6, 6), as exact as a double is."""
+    rows = zip(t_ns, covariances, strict=True)
+    lines = [f"{t}," + ",".join(repr(float(v)) for v in C[UPPER]) + "\n" for t, C in rows]
+    write_text(path, HEADER + "".join(lines))
+
+
+def read_covariances(path: Path) -> tuple[NDArray[np.int64], Array]:
+    """t_ns (N,) and covariances (N, 6, 6); SourceError where a row is not such."""
+    table = read_table(path, len(NAMES), ns_from_text)
+    if table.bad:
+        raise SourceError(f"{path} line {table.bad[0]}: expected t_ns and {len(NAMES)} numbers")
+    out = np.zeros((len(table.t_ns), 6, 6))
+    out[:, UPPER[0], UPPER[1]] = table.values[:, : len(NAMES)]
+    out[:, UPPER[1], UPPER[0]] = table.values[:, : len(NAMES)]
+    return table.t_ns, out
