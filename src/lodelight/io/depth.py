@@ -1,0 +1,42 @@
+"""Depth images as stored to metres along z of camera 0, registered to it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lodelight.errors import SourceError
+from lodelight.rig import CameraSpec, DepthSpec
+from lodelight.types import ArrayF32
+
+# An indoor depth camera's median reading lies well inside; outside, the unit is wrong and not the room.
+PLAUSIBLE_MEDIAN_M = (0.05, 100.0)
+
+
+class DepthReader:
+    """Converts the images of one depth sensor. Stored values of 0, and readings out of its range, become 0."""
+
+    def __init__(self, spec: DepthSpec, cam0: CameraSpec) -> None:
+        self.spec = spec
+        raw = np.arange(1 << 16, dtype=np.float64)
+        metres = raw / spec.units_per_m
+        self._table = np.where((metres >= spec.min_m) & (metres <= spec.max_m), metres, 0.0).astype(np.float32)
+        self._table[0] = 0.0
+
+    def metres(self, raw: NDArray[np.uint16]) -> ArrayF32:
+        """(H, W) stored values to (H', W') m of camera 0, 0 = no reading."""
+        return np.take(self._table, raw)
+
+    def median_m(self, raw: NDArray[np.uint16]) -> float | None:
+        """Median of all readings before the range is applied; None where there is no reading."""
+        readings = raw[(raw > 0) & (raw < 65535)]
+        return float(np.median(readings)) / self.spec.units_per_m if len(readings) else None
+
+    def check_unit(self, median_m: float, where: str) -> None:
+        """Raises SourceError where half the readings lie nearer, or farther, than any room allows."""
+        low, high = PLAUSIBLE_MEDIAN_M
+        if not low <= median_m <= high:
+            raise SourceError(
+                f"{where}: the median depth is {median_m:.3g} m, so {self.spec.units_per_m:g} units per metre is the "
+                "wrong unit; set depth.units_per_m in the rig file"
+            )

@@ -1,0 +1,153 @@
+"""Recordings that are lists of image files: the common half of most formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lodelight.errors import SourceError
+from lodelight.io.depth import DepthReader
+from lodelight.io.pictures import BadFrame, read_grey, read_raw
+from lodelight.io.recording import Recording, Shot
+from lodelight.io.stamps import NS_PER_S, increasing
+from lodelight.messages import Frame, Imu
+from lodelight.rig import CameraSpec, Rig
+from lodelight.trajectory import Trajectory
+from lodelight.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Listing:
+    """The frames of a recording, in the order of its files.
+
+    t_ns : (N,) stamps of camera 0; images : per camera N paths, None where it took none
+    depth : N paths, None where there is none near enough in time; None without a depth sensor
+    """
+
+    t_ns: NDArray[np.int64]
+    images: tuple[list[Path | None], ...]
+    depth: list[Path | None] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ImuTable:
+    """Inertial samples in the body frame. t_ns : (N,); gyro : (N, 3) rad/s; accel : (N, 3) m/s^2."""
+
+    t_ns: NDArray[np.int64]
+    gyro: Array
+    accel: Array
+
+
+class ListedRecording(Recording):
+    """A recording whose files are all known beforehand."""
+
+    def __init__(
+        self,
+        path: Path,
+        format: str,
+        rig: Rig,
+        listing: Listing,
+        imu: ImuTable | None = None,
+        truth: Callable[[], Trajectory | None] | None = None,
+    ) -> None:
+        """Keeps of the rig what the files serve. Raises SourceError on an empty list."""
+        if not len(listing.t_ns):
+            raise SourceError(f"{path} is an empty recording: it lists no frame")
+        cameras = rig.cameras[: len(listing.images)]
+        cameras = tuple(spec if spec.rate_hz > 0 else _with_rate(spec, listing.t_ns) for spec in cameras)
+        rig = replace(
+            rig,
+            cameras=cameras,
+            depth=rig.depth if listing.depth is not None else None,
+            imu=rig.imu if imu is not None else None,
+        )
+        super().__init__(path, format, rig)
+        self._listing = listing
+        self._keep = increasing(listing.t_ns)
+        self._imu_table = imu
+        self._truth = truth
+        self._depth_reader = DepthReader(rig.depth, rig.cameras[0]) if rig.depth else None
+
+    @property
+    def n_frames(self) -> int:
+        return len(self._listing.t_ns)
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        kept = self._listing.t_ns[self._keep]
+        return int(kept[0]), int(kept[-1])
+
+    def ground_truth(self) -> Trajectory | None:
+        return self._truth() if self._truth else None
+
+    def imu(self) -> Iterator[Imu]:
+        table = self._imu_table
+        if table is None:
+            return
+        for t_ns, gyro, accel in zip(table.t_ns.tolist(), table.gyro, table.accel, strict=True):
+            yield Imu(t_ns, gyro, accel)
+
+    def shots(self, cameras: int, depth: bool) -> Iterator[Shot]:
+        if depth:
+            self._check_depth()
+        for i, t_ns in enumerate(self._listing.t_ns.tolist()):
+            path = self._listing.images[0][i]
+            yield Shot(t_ns, str(path), partial(self._load, i, cameras, depth))
+
+    def _load(self, i: int, cameras: int, depth: bool) -> Frame:
+        listing = self._listing
+        t_ns = int(listing.t_ns[i])
+        if not self._keep[i]:
+            raise BadFrame("stamp is a duplicate or out of order")
+        images = []
+        for spec, paths in zip(self.rig.cameras[:cameras], listing.images, strict=False):
+            path = paths[i]
+            if path is None:
+                raise BadFrame(f"{spec.name} has no image near enough in time")
+            images.append(read_grey(path, (spec.camera.width, spec.camera.height)))
+        if not depth:
+            return Frame(t_ns, tuple(images))
+        assert self._depth_reader is not None
+        return Frame(t_ns, tuple(images), self._depth_reader.metres(self._raw_depth(i)))
+
+    def _raw_depth(self, i: int) -> NDArray[np.uint16]:
+        assert self._listing.depth is not None
+        assert self.rig.depth is not None
+        path = self._listing.depth[i]
+        if path is None:
+            raise BadFrame("no depth image near enough in time")
+        lens = self.rig.depth.camera
+        return read_raw(path, (lens.width, lens.height))
+
+    def _check_depth(self) -> None:
+        """Stop early where the depth is nothing at all, or in another unit than the rig says.
+
+        Looks at five frames spread over the recording, and at the others only where these are empty.
+        """
+        assert self._depth_reader is not None
+        assert self._listing.depth is not None
+        n = self.n_frames
+        probes = dict.fromkeys([*np.linspace(0, n - 1, min(n, 5)).astype(int).tolist(), *range(n)])
+        readable = 0
+        for i in probes:
+            try:
+                median_m = self._depth_reader.median_m(self._raw_depth(i))
+            except BadFrame:
+                continue
+            readable += 1
+            if median_m is not None:
+                self._depth_reader.check_unit(median_m, str(self._listing.depth[i]))
+                return
+        if readable:
+            raise SourceError(f"{self.path}: all {readable} depth images are zero; check the depth sensor")
+
+
+def _with_rate(spec: CameraSpec, t_ns: NDArray[np.int64]) -> CameraSpec:
+    """The rate the stamps have, where the rig does not say one."""
+    gap_ns = float(np.median(np.abs(np.diff(t_ns)))) if len(t_ns) > 1 else 0.0
+    return replace(spec, rate_hz=round(NS_PER_S / gap_ns, 3)) if gap_ns > 0 else spec

@@ -1,0 +1,168 @@
+"""What every recording offers, whatever its format: a rig, a stream of messages, perhaps the truth.
+
+A format gives its frames as `Shot`s, undecoded; this file decodes them ahead on a thread, leaves out those that
+cannot be used, weaves the IMU in, and says what was left out.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from lodelight.errors import ConfigError, SourceError
+from lodelight.io.pictures import BadFrame
+from lodelight.io.prefetch import prefetch
+from lodelight.io.stamps import NS_PER_S
+from lodelight.messages import Frame, Imu, Message
+from lodelight.rig import Rig
+from lodelight.trajectory import Trajectory
+
+CAMERAS = {"mono": 1, "stereo": 2, "rgbd": 1}
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A frame that was left out: its stamp (the reader's clock), the file it came from, and why."""
+
+    t_ns: int
+    where: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame not decoded yet. `load` may run on another thread, in the order of the shots; it may raise BadFrame."""
+
+    t_ns: int
+    where: str
+    load: Callable[[], Frame]
+
+
+class Recording(ABC):
+    """A recording that is read as a stream.
+
+    name : of its folder or file; format : "euroc", "tum_rgbd", ...; rig : only of sensors the recording has
+    skipped : the single frames the last `messages` left out so far
+    """
+
+    def __init__(self, path: Path, format: str, rig: Rig) -> None:
+        self.path = path
+        self.name = path.resolve().name
+        self.format = format
+        self.rig = rig
+        self.skipped: list[Skipped] = []
+
+    @property
+    @abstractmethod
+    def n_frames(self) -> int:
+        """Frames it lists, usable or not."""
+
+    @property
+    @abstractmethod
+    def span_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last frame, on the recording's own camera clock."""
+
+    @abstractmethod
+    def shots(self, cameras: int, depth: bool) -> Iterator[Shot]:
+        """All frames with that many images and with depth if asked. Stamps increase, but for shots that only raise."""
+
+    def imu(self) -> Iterator[Imu]:
+        """All inertial samples, stamps increasing, on the recording's own IMU clock."""
+        return iter(())
+
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_body where the recording has it; for evaluation alone."""
+        return None
+
+    @property
+    def duration_s(self) -> float:
+        first, last = self.span_ns
+        return (last - first) / NS_PER_S
+
+    def messages(self, sensors: str, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Message]:
+        """Frames and IMU samples in the order of their stamps, an IMU sample before the frame of the same stamp.
+
+        sensors : "mono", "stereo" or "rgbd", each also with "-inertial"
+        start_s, end_s : seconds from the first frame; IMU samples one beyond either end come too, and at
+            start_s = 0 all that precede the first frame
+        Stamps have the rig's time offsets added: they are on the body's clock.
+        Raises ConfigError on unknown sensors, SourceError on ones the recording lacks or when no frame is usable.
+        """
+        base, _, suffix = sensors.partition("-")
+        if base not in CAMERAS or suffix not in ("", "inertial") or sensors.endswith("-"):
+            raise ConfigError(f"sensors {sensors!r} are unknown; choose one of {', '.join(CAMERAS)} (-inertial)")
+        rig = self.rig
+        if CAMERAS[base] > len(rig.cameras) or (base == "rgbd" and not rig.depth) or (suffix and not rig.imu):
+            raise SourceError(f"{self.path} cannot serve {sensors}; the most it can is {rig.sensors}")
+        self.skipped = []
+        offset_ns = round(rig.cameras[0].time_offset_s * NS_PER_S)
+        first_ns = self.span_ns[0] + offset_ns
+        low = first_ns + start_s * NS_PER_S if start_s > 0 else -math.inf
+        high = first_ns + end_s * NS_PER_S
+        frames = self._frames(CAMERAS[base], base == "rgbd", offset_ns, low, high)
+        return self._woven(frames, self._imu(low, high)) if suffix else frames
+
+    def _frames(
+        self, cameras: int, depth: bool, offset_ns: int, low: float, high: float
+    ) -> Generator[Frame, None, None]:
+        def load(shot: Shot) -> Frame | Skipped:
+            t_ns = shot.t_ns + offset_ns
+            try:
+                frame = shot.load()
+            except BadFrame as bad:
+                return Skipped(t_ns, shot.where, str(bad))
+            return Frame(t_ns, frame.images, frame.depth)
+
+        wanted = (shot for shot in self.shots(cameras, depth) if low <= shot.t_ns + offset_ns <= high)
+        usable = False
+        with closing(prefetch(wanted, load)) as loaded:
+            for item in loaded:
+                if isinstance(item, Frame):
+                    usable = True
+                    yield item
+                else:
+                    self.skipped.append(item)
+        if not usable:
+            raise SourceError(self._why_nothing())
+
+    def _imu(self, low: float, high: float) -> Iterator[Imu]:
+        assert self.rig.imu is not None
+        offset_ns = round(self.rig.imu.time_offset_s * NS_PER_S)
+        before: Imu | None = None
+        for raw in self.imu():
+            sample = Imu(raw.t_ns + offset_ns, raw.gyro, raw.accel)
+            if sample.t_ns < low:
+                before = sample
+                continue
+            if before is not None:
+                yield before
+                before = None
+            yield sample
+            if sample.t_ns >= high:
+                return
+
+    def _woven(self, frames: Generator[Frame, None, None], imu: Iterator[Imu]) -> Iterator[Message]:
+        streams: tuple[Iterator[Message], Iterator[Message]] = (imu, frames)
+        with closing(frames):  # the decoding thread ends with this iterator
+            yield from heapq.merge(*streams, key=lambda message: message.t_ns)
+
+    def _why_nothing(self) -> str:
+        if not self.skipped:
+            return f"{self.path} has no frame in the time asked for; it lasts {self.duration_s:.3f} s"
+        return f"{self.path}: no frame can be used; {summarize(self.skipped)}"
+
+
+def summarize(skipped: list[Skipped]) -> str:
+    """One line: how many frames were left out for which reasons, with the first file of each."""
+    if not skipped:
+        return "no frame skipped"
+    first = {item.reason: item.where for item in reversed(skipped)}
+    counts = Counter(item.reason for item in skipped)
+    reasons = "; ".join(f"{n}x {reason} (first: {first[reason]})" for reason, n in counts.most_common(4))
+    return f"{len(skipped)} frame{'s' if len(skipped) > 1 else ''} skipped: {reasons}"
