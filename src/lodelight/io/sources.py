@@ -8,6 +8,7 @@ from pathlib import Path
 from lodelight.errors import SourceError
 from lodelight.io import tum_rgbd
 from lodelight.io.recording import Recording
+from lodelight.io.rig_toml import read_rig
 from lodelight.rig import Rig
 
 FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path, Rig | None], Recording]], ...] = (
@@ -25,9 +26,10 @@ def open_source(path: str | Path, rig: Rig | str | Path | None = None) -> Record
     path = Path(path)
     if not path.exists():
         raise SourceError(f"recording {path} does not exist")
-    if not isinstance(rig, Rig | None):
-        raise NotImplementedError
+    if rig is None and (path / "rig.toml").is_file():
+        rig = path / "rig.toml"
+    known = read_rig(rig) if isinstance(rig, str | Path) else rig
     for recognize, read in FORMATS:
         if recognize(path):
-            return read(path, rig)
+            return read(path, known)
     raise SourceError(f"{path} is no recording known here")
