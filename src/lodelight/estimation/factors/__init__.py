@@ -1,0 +1,1 @@
+"""One file per measurement: its residual, Jacobian, noise and source."""

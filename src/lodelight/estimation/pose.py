@@ -1,0 +1,204 @@
+"""One pose against points that are held fixed: the estimate of every frame.
+
+Levenberg-Marquardt on the reprojection factor in rounds. The first rounds carry Huber's kernel; after each, every
+observation is tested again at the 95 % bound, so that one taken for an outlier can return; the last rounds run on the
+inliers alone, without kernel, where the estimate is efficient and its covariance the inverse of the information.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lodelight.compiled import kernel
+from lodelight.estimation.dense import cholesky, cholesky_solve, spd_inverse
+from lodelight.estimation.factors.pose_prior import add_pose_prior
+from lodelight.estimation.factors.reprojection import CHI2_PX, CHI2_PX_DEPTH, inliers_of, reprojection
+from lodelight.estimation.robust import huber
+from lodelight.geometry.cameras import Camera
+from lodelight.geometry.se3 import SE3
+from lodelight.geometry.so3 import so3_exp
+from lodelight.types import Array, Bools
+
+ROUNDS = 4
+ROBUST_ROUNDS = 2
+ITERATIONS = 10
+# A step whose predicted gain in chi-square is below this moves the pose by 1e-5 of its own standard deviation.
+CONVERGED_CHI2 = 1e-10
+# What is known of a pose indoors when nothing is measured: it keeps a covariance finite where points do not.
+BROAD_SIGMA_RAD = math.pi
+BROAD_SIGMA_M = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResult:
+    """covariance : (6, 6), chart of SE3.perturbed, (J^T J)^-1 of the inliers times max(1, chi2 / dof)
+    inliers : (N,) inside the 95 % bound; chi2 : (N,) unweighted, inf where the camera cannot see the point
+    """
+
+    T_world_body: SE3
+    covariance: Array
+    inliers: Bools
+    chi2: Array
+
+    @property
+    def n_inliers(self) -> int:
+        return int(np.count_nonzero(self.inliers))
+
+
+def optimize_pose(
+    T_world_body: SE3,
+    T_body_cam: SE3,
+    camera: Camera,
+    xyz: Array,
+    px: Array,
+    sigma_px: Array,
+    inv_depth: Array,
+    sigma_inv_depth: Array,
+    information_weight: Array | None = None,
+    prior: tuple[SE3, Array] | None = None,
+) -> PoseResult:
+    """Most likely T_world_body given points of the world seen by camera 0.
+
+    T_world_body : where to start
+    xyz (N, 3) m, world; px (N, 2) raw pixels; sigma_px (N,)
+    inv_depth, sigma_inv_depth (N,) 1/m along the camera's z; inv_depth 0 = not measured
+    information_weight (N,) : scales what an observation says, not its test as an outlier; default 1
+    prior : a mean and its information (6, 6) in the chart of SE3.perturbed
+    Never raises on too few or degenerate observations: the covariance grows instead, up to pi rad and 1 km.
+    """
+    n = len(xyz)
+    mean, information = prior if prior is not None else (T_world_body, np.zeros((6, 6)))
+    R, p = T_world_body.R.copy(), T_world_body.t.copy()
+    chi2, inliers, covariance = _optimize(
+        camera.model, camera.params, R, p, _f64(T_body_cam.R), _f64(T_body_cam.t),
+        _f64(xyz), _f64(px), _f64(sigma_px), _f64(inv_depth), _f64(sigma_inv_depth),
+        np.ones(n) if information_weight is None else _f64(information_weight),
+        _f64(mean.R), _f64(mean.t), _f64(information), prior is not None,
+    )  # fmt: skip
+    return PoseResult(SE3(R, p), covariance, inliers, chi2)
+
+
+def _f64(a: Array) -> Array:
+    return np.ascontiguousarray(a, dtype=np.float64)
+
+
+@kernel
+def _linearize(
+    model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array, xyz: Array, px: Array,
+    sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, weight: Array, active: Bools, robust: bool,
+    before: Array, chi2: Array, H: Array, g: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Fill chi2 (N,), H (6, 6) lower half and g (6,); returns the cost, and the cost comparable with `before`.
+
+    Comparable: over the observations seen in `before`; one that left the view keeps the cost it had there, so a
+    step is neither rewarded for losing points nor stopped by one.
+    """
+    r, J, E = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
+    H[:] = 0.0
+    g[:] = 0.0
+    cost = comparable = 0.0
+    for i in range(xyz.shape[0]):
+        rows = reprojection(
+            model, params, R, p, R_body_cam, p_body_cam, xyz[i], px[i, 0], px[i, 1],
+            sigma_px[i], inv_depth[i], sigma_inv_depth[i], r, J, E,
+        )  # fmt: skip
+        bound = math.inf if not robust else CHI2_PX_DEPTH if inv_depth[i] > 0.0 else CHI2_PX
+        if rows == 0:
+            chi2[i] = math.inf
+            if active[i] and before[i] < math.inf:
+                comparable += weight[i] * huber(before[i], bound)[0]
+            continue
+        chi2[i] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+        if not active[i]:
+            continue
+        value, w = huber(chi2[i], bound)
+        cost += weight[i] * value
+        if before[i] < math.inf:
+            comparable += weight[i] * value
+        w *= weight[i]
+        for k in range(rows):
+            J[k, 3], J[k, 4], J[k, 5] = -J[k, 3], -J[k, 4], -J[k, 5]
+            for a in range(6):
+                wj = w * J[k, a]
+                g[a] += wj * r[k]
+                for b in range(a + 1):
+                    H[a, b] += wj * J[k, b]
+    return cost, comparable
+
+
+@kernel
+def _optimize(
+    model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array, xyz: Array, px: Array,
+    sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, weight: Array,
+    R_prior: Array, p_prior: Array, prior_information: Array, has_prior: bool,
+) -> tuple[Array, Bools, Array]:  # fmt: skip
+    """Move R and p to the optimum; returns chi2 (N,), inliers (N,) and covariance (6, 6)."""
+    n = xyz.shape[0]
+    chi2, trial_chi2 = np.full(n, math.inf), np.empty(n)
+    H, g, trial_H, trial_g = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6)
+    active = np.ones(n, np.bool_)
+    for round_ in range(ROUNDS + 1):
+        # the round after the last one only evaluates, for chi2 and information at the result
+        robust = round_ < ROBUST_ROUNDS
+        cost, _ = _linearize(
+            model, params, R, p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth, sigma_inv_depth,
+            weight, active, robust, chi2, chi2, H, g,
+        )  # fmt: skip
+        if has_prior:
+            cost += add_pose_prior(R, p, R_prior, p_prior, prior_information, H, g)
+        if round_ == ROUNDS:
+            break
+        damping = 1e-9
+        for _ in range(ITERATIONS):
+            L, step = H.copy(), -g
+            for a in range(6):
+                L[a, a] += damping * H[a, a] + 1e-12
+            if not cholesky(L):
+                damping = max(100.0 * damping, 1e-6)
+                continue
+            cholesky_solve(L, step)
+            if -np.dot(g, step) < CONVERGED_CHI2:
+                break
+            trial_R, trial_p = R @ so3_exp(step[:3]), p + step[3:]
+            trial_cost, comparable = _linearize(
+                model, params, trial_R, trial_p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth,
+                sigma_inv_depth, weight, active, robust, chi2, trial_chi2, trial_H, trial_g,
+            )  # fmt: skip
+            if has_prior:
+                prior_cost = add_pose_prior(trial_R, trial_p, R_prior, p_prior, prior_information, trial_H, trial_g)
+                trial_cost += prior_cost
+                comparable += prior_cost
+            if comparable <= cost:
+                R[:], p[:], cost = trial_R, trial_p, trial_cost
+                H, trial_H, g, trial_g, chi2, trial_chi2 = trial_H, H, trial_g, g, trial_chi2, chi2
+                damping = max(0.1 * damping, 1e-9)
+            else:
+                damping = max(100.0 * damping, 1e-6)
+        retested = inliers_of(chi2, inv_depth)
+        if not robust and np.all(retested == active):
+            break
+        active = retested
+    inliers = inliers_of(chi2, inv_depth)
+    return chi2, inliers, _covariance(H, cost, inliers, inv_depth, has_prior)
+
+
+@kernel
+def _covariance(H: Array, cost: float, inliers: Bools, inv_depth: Array, has_prior: bool) -> Array:
+    """Inverse information, widened where the residuals are larger than their sigmas say."""
+    dof = 0 if has_prior else -6
+    for i in range(len(inliers)):
+        if inliers[i]:
+            dof += 3 if inv_depth[i] > 0.0 else 2
+    widen = max(1.0, cost / dof) if dof > 0 else 1.0
+    information = H / widen
+    for a in range(6):
+        information[a, a] += 1.0 / (BROAD_SIGMA_RAD**2 if a < 3 else BROAD_SIGMA_M**2)
+    covariance, proper = spd_inverse(information)
+    if not proper:  # rounding of a singular H: nothing is known
+        covariance[:] = 0.0
+        for a in range(6):
+            covariance[a, a] = BROAD_SIGMA_RAD**2 if a < 3 else BROAD_SIGMA_M**2
+    return covariance
