@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lodelight.errors import SourceError
+from lodelight.io.registration import Registration
 from lodelight.rig import CameraSpec, DepthSpec
 from lodelight.types import ArrayF32
 
@@ -22,10 +23,14 @@ class DepthReader:
         metres = raw / spec.units_per_m
         self._table = np.where((metres >= spec.min_m) & (metres <= spec.max_m), metres, 0.0).astype(np.float32)
         self._table[0] = 0.0
+        own_view = spec.registered or (spec.camera is cam0.camera and spec.T_body_depth is cam0.T_body_cam)
+        T_cam_depth = cam0.T_body_cam.inverse() @ spec.T_body_depth
+        self._registration = None if own_view else Registration(spec.camera, cam0.camera, T_cam_depth)
 
     def metres(self, raw: NDArray[np.uint16]) -> ArrayF32:
         """(H, W) stored values to (H', W') m of camera 0, 0 = no reading."""
-        return np.take(self._table, raw)
+        depth_m = np.take(self._table, raw)
+        return self._registration(depth_m) if self._registration else depth_m
 
     def median_m(self, raw: NDArray[np.uint16]) -> float | None:
         """Median of all readings before the range is applied; None where there is no reading."""

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lodelight.errors import SourceError
-from lodelight.io import tum_rgbd
+from lodelight.io import sevenscenes, tum_rgbd
 from lodelight.io.recording import Recording
 from lodelight.io.rig_toml import read_rig
 from lodelight.rig import Rig
 
 FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path, Rig | None], Recording]], ...] = (
     (tum_rgbd.recognize, tum_rgbd.open_tum_rgbd),
+    (sevenscenes.recognize, sevenscenes.open_sevenscenes),
 )
 
 
