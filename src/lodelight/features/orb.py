@@ -1,0 +1,195 @@
+"""Oriented binary features: FAST corners spread over image and scales, sub-pixel, with 256-bit descriptors.
+
+The descriptor compares 256 pairs of pixels of the smoothed patch, turned by the patch's orientation. The pairs were
+chosen on real and rendered images by `tools/train_descriptor.py` and lie in `data/descriptor_pairs.npy`.
+Sources: Rosten and Drummond 2006 (FAST); Rublee et al. 2011 (oriented BRIEF, intensity centroid, greedy choice of
+pairs); Foerstner and Guelch 1987 (sub-pixel corner).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import cv2
+import numpy as np
+
+from lodelight.compiled import kernel
+from lodelight.features.features import Features
+from lodelight.geometry.cameras import Camera
+from lodelight.types import AnyArray, Array, ArrayF32, Bytes, Ints, Words
+
+PATCH_RADIUS = 15
+BORDER = PATCH_RADIUS + 2
+N_ANGLES = 64
+
+
+@dataclass(frozen=True)
+class OrbConfig:
+    """n_features is per image; fast_threshold is the least contrast of a corner in grey values."""
+
+    n_features: int = 1000
+    n_levels: int = 8
+    scale_factor: float = 1.2
+    fast_threshold: int = 7
+
+    def scale(self, octave: Ints) -> Array:
+        """Size of a pixel of a pyramid level in pixels of the image: also its corners' noise relative to level 0."""
+        out: Array = self.scale_factor ** octave.astype(np.float64)
+        return out
+
+
+class OrbExtractor:
+    """Features of images of one camera."""
+
+    def __init__(self, camera: Camera, config: OrbConfig | None = None) -> None:
+        self.camera = camera
+        self.config = config or OrbConfig()
+        share = self.config.scale_factor ** -np.arange(self.config.n_levels)
+        self._quota = np.maximum(1, np.rint(self.config.n_features * share / share.sum())).astype(int)
+        self._fast = cv2.FastFeatureDetector.create(self.config.fast_threshold, True)
+
+    def pyramid(self, image: Bytes) -> list[Bytes]:
+        """The image and its reductions by the scale factor; levels too small for a patch are left out."""
+        levels = [image]
+        height, width = image.shape
+        for level in range(1, self.config.n_levels):
+            scale = self.config.scale_factor**level
+            size = (round(width / scale), round(height / scale))
+            if min(size) < 4 * BORDER:
+                break
+            levels.append(np.asarray(cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR), np.uint8))
+        return levels
+
+    def extract(self, pyramid: list[Bytes]) -> Features:
+        """Corners of all levels of `pyramid(image)`, described; without depth."""
+        height, width = pyramid[0].shape
+        found = []
+        for octave, level in enumerate(pyramid):
+            corners = self._corners(level, self._quota[octave])
+            smooth = np.asarray(cv2.GaussianBlur(level, (7, 7), 2.0, borderType=cv2.BORDER_REFLECT_101), np.uint8)
+            angle = orientations(level, corners)
+            desc = describe(smooth, corners, angle, _turned_pairs())
+            scale = np.array([width / level.shape[1], height / level.shape[0]])
+            px = (
+                refine_corners(level, corners) + 0.5
+            ) * scale - 0.5  # a resized image keeps its edges, not its centres
+            found.append((px, np.full(len(px), octave, np.int32), angle, desc))
+        px, octave_of, angle, desc = (np.concatenate(column) for column in zip(*found, strict=True))
+        ray, seen = self.camera.unproject(px)
+        no_depth = np.zeros(len(px), np.float32)
+        features = Features(px.astype(np.float32), octave_of, angle, desc, ray, no_depth, no_depth)
+        return features if seen.all() else features.take(seen)
+
+    def _corners(self, level: Bytes, quota: int) -> Ints:
+        """(N, 2) int pixels: the strongest corner of every cell, then the second of every cell, up to the quota."""
+        inner = level[BORDER:-BORDER, BORDER:-BORDER]
+        keypoints = self._fast.detect(inner)
+        if not keypoints:
+            return np.zeros((0, 2), np.int32)
+        px = np.rint(cv2.KeyPoint.convert(keypoints)).astype(np.int32)
+        response = np.array([k.response for k in keypoints], np.float32)
+        height, width = inner.shape
+        cell_px = math.sqrt(height * width / quota)
+        chosen: Ints = px[spread(px, response, cell_px, width, height, quota)] + np.int32(BORDER)
+        return chosen
+
+
+@cache
+def _turned_pairs() -> AnyArray:
+    """The descriptor's pairs (x1, y1, x2, y2) turned to N_ANGLES directions, (N_ANGLES, 256, 4) int8."""
+    pairs = np.load(str(files("lodelight") / "data" / "descriptor_pairs.npy")).astype(np.float64)
+    angle = 2.0 * np.pi * np.arange(N_ANGLES) / N_ANGLES
+    c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
+    x, y = pairs[None, :, 0::2], pairs[None, :, 1::2]
+    out = np.empty((N_ANGLES, len(pairs), 4), np.int8)
+    out[..., 0::2] = np.rint(c * x - s * y)
+    out[..., 1::2] = np.rint(s * x + c * y)
+    return out
+
+
+@kernel
+def spread(px: Ints, response: ArrayF32, cell_px: float, width: int, height: int, quota: int) -> Ints:
+    """Indices of at most `quota` corners, taken round by round: the best of every cell, the second best, and so on."""
+    columns = int(width / cell_px) + 1
+    taken = np.zeros(columns * (int(height / cell_px) + 1), np.int32)
+    order = np.argsort(-response, kind="mergesort")
+    rank = np.empty(len(px), np.int32)
+    for i in order:
+        cell = int(px[i, 1] / cell_px) * columns + int(px[i, 0] / cell_px)
+        rank[i] = taken[cell]
+        taken[cell] += 1
+    by_rank = order[np.argsort(rank[order], kind="mergesort")]
+    return by_rank[:quota].astype(np.int32)
+
+
+@kernel
+def orientations(image: Bytes, px: Ints) -> ArrayF32:
+    """(N,) rad: direction from the patch's centre to its intensity centroid, over a disk."""
+    half_width = np.empty(PATCH_RADIUS + 1, np.int32)
+    for v in range(PATCH_RADIUS + 1):
+        half_width[v] = int(math.sqrt(PATCH_RADIUS * PATCH_RADIUS - v * v) + 0.5)
+    out = np.empty(len(px), np.float32)
+    for i in range(len(px)):
+        x, y = px[i, 0], px[i, 1]
+        m10 = m01 = 0
+        for v in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+            row = image[y + v]
+            total = 0
+            for u in range(-half_width[abs(v)], half_width[abs(v)] + 1):
+                value = int(row[x + u])
+                m10 += u * value
+                total += value
+            m01 += v * total
+        out[i] = math.atan2(float(m01), float(m10))
+    return out
+
+
+@kernel
+def describe(smooth: Bytes, px: Ints, angle: ArrayF32, turned_pairs: AnyArray) -> Words:
+    """(N, 4) uint64 descriptors: one bit a pair, set where the first pixel of the pair is darker."""
+    out = np.zeros((len(px), 4), np.uint64)
+    for i in range(len(px)):
+        x, y = px[i, 0], px[i, 1]
+        pairs = turned_pairs[int(np.rint(angle[i] * (N_ANGLES / (2.0 * math.pi)))) % N_ANGLES]
+        for word in range(4):
+            bits = np.uint64(0)
+            for k in range(64):
+                p = pairs[64 * word + k]
+                darker = smooth[y + p[1], x + p[0]] < smooth[y + p[3], x + p[2]]
+                bits |= np.uint64(darker) << np.uint64(k)
+            out[i, word] = bits
+    return out
+
+
+@kernel
+def refine_corners(image: Bytes, px: Ints) -> Array:
+    """(N, 2) sub-pixel corners: the point to which the gradients around are most nearly perpendicular.
+
+    A corner that would move by more than a pixel, or has no two directions of gradient, stays where it is.
+    """
+    radius = 3
+    out = np.empty((len(px), 2))
+    for i in range(len(px)):
+        x0, y0 = px[i, 0], px[i, 1]
+        out[i, 0], out[i, 1] = x0, y0
+        a = b = c = r = s = 0.0
+        for v in range(-radius, radius + 1):
+            for u in range(-radius, radius + 1):
+                gx = 0.5 * (float(image[y0 + v, x0 + u + 1]) - float(image[y0 + v, x0 + u - 1]))
+                gy = 0.5 * (float(image[y0 + v + 1, x0 + u]) - float(image[y0 + v - 1, x0 + u]))
+                w = math.exp(-0.5 * (u * u + v * v) / 2.25)
+                a += w * gx * gx
+                b += w * gx * gy
+                c += w * gy * gy
+                r += w * gx * (gx * u + gy * v)
+                s += w * gy * (gx * u + gy * v)
+        det = a * c - b * b
+        if det > 1e-3 * (a + c) * (a + c):
+            dx, dy = (c * r - b * s) / det, (a * s - b * r) / det
+            if dx * dx + dy * dy < 1.0:
+                out[i, 0] += dx
+                out[i, 1] += dy
+    return out
