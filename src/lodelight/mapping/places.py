@@ -1,0 +1,191 @@
+"""Which keyframes look like this one: an inverted index over their visual words.
+
+Every word has a list of the keyframes that show it, with the word's share in their whole; the similarity of two
+images is what their shares have in common, sum of min(a, b), in [0, 1] (Nister and Stewenius 2006, with the L1 norm).
+Words are found anew when a map is loaded: 1 ms a keyframe, and the file stays free of the vocabulary.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lodelight.compiled import kernel
+from lodelight.mapping.map import Map
+from lodelight.mapping.vocabulary import Vocabulary
+from lodelight.types import AnyArray, ArrayF32, Bools, Ints, Words
+
+COMMON_WORDS = 0.8  # of the most that any keyframe shares: fewer, and it is no candidate
+GROUP_SIZE = 10  # covisible keyframes whose scores a candidate adds to its own
+GROUP_SCORE = 0.75  # of the best group's score: lower, and the group is no candidate
+GROUPS_LOOKED_AT = 40  # a bound on the time of a query, far above what the rules above leave
+
+
+@kernel
+def bag_of_words(words: Ints, idf: ArrayF32) -> tuple[Ints, ArrayF32]:
+    """The distinct words of an image, rising, and their shares: term frequency times idf, with sum 1."""
+    ordered = np.sort(words)
+    distinct = np.empty(len(words), np.int32)
+    share = np.zeros(len(words), np.float32)
+    n = 0
+    total = 0.0
+    for w in ordered:
+        if n == 0 or distinct[n - 1] != w:
+            distinct[n] = w
+            n += 1
+        share[n - 1] += idf[w]
+        total += idf[w]
+    if total > 0.0:
+        share /= np.float32(total)
+    return distinct[:n].copy(), share[:n].copy()
+
+
+@kernel
+def insert(keyframe: int, words: Ints, shares: ArrayF32, lists: Ints, keyframe_of: Ints, share_of: ArrayF32) -> None:
+    """Append (keyframe, share) to the words' lists. `lists` (W, 3) = first, count, room; there must be room."""
+    for i in range(len(words)):
+        w = words[i]
+        at = lists[w, 0] + lists[w, 1]
+        keyframe_of[at] = keyframe
+        share_of[at] = shares[i]
+        lists[w, 1] += 1
+
+
+@kernel
+def erase(keyframe: int, words: Ints, lists: Ints, keyframe_of: Ints, share_of: ArrayF32) -> None:
+    """Take a keyframe out of the words' lists. Their order changes; no sum depends on it."""
+    for w in words:
+        first, last = lists[w, 0], lists[w, 0] + lists[w, 1] - 1
+        for at in range(first, last + 1):
+            if keyframe_of[at] == keyframe:
+                keyframe_of[at] = keyframe_of[last]
+                share_of[at] = share_of[last]
+                lists[w, 1] -= 1
+                break
+
+
+@kernel
+def enlarge(words: Ints, end: int, lists: Ints, keyframe_of: Ints, share_of: ArrayF32) -> int:
+    """Move the full ones of the words' lists to the end of the pool, with twice the room; returns the new end."""
+    for w in words:
+        first, count, room = lists[w, 0], lists[w, 1], lists[w, 2]
+        if count == room:
+            keyframe_of[end : end + count] = keyframe_of[first : first + count]
+            share_of[end : end + count] = share_of[first : first + count]
+            lists[w, 0] = end
+            lists[w, 2] = max(4, 2 * room)
+            end += lists[w, 2]
+    return end
+
+
+@kernel
+def compare(
+    words: Ints, shares: ArrayF32, lists: Ints, keyframe_of: Ints, share_of: ArrayF32, n_keyframes: int
+) -> tuple[ArrayF32, Ints]:
+    """Similarity to every keyframe, and how many distinct words they have in common."""
+    score = np.zeros(n_keyframes, np.float32)
+    common = np.zeros(n_keyframes, np.int32)
+    for i in range(len(words)):
+        first = lists[words[i], 0]
+        for at in range(first, first + lists[words[i], 1]):
+            k = keyframe_of[at]
+            score[k] += min(shares[i], share_of[at])
+            common[k] += 1
+    return score, common
+
+
+class Places:
+    """The index of a map's keyframes: all it has when this is made, then those added. Who culls one removes it here."""
+
+    def __init__(self, map: Map, vocabulary: Vocabulary | None = None) -> None:
+        self.map = map
+        self.vocabulary = vocabulary or Vocabulary.shipped()
+        self._lists = np.zeros((len(self.vocabulary), 3), np.int32)
+        self._keyframe_of = np.zeros(1 << 14, np.int32)
+        self._share_of = np.zeros(1 << 14, np.float32)
+        self._end = 0
+        self._indexed: set[int] = set()
+        for keyframe in map.alive_keyframes:
+            self.add(int(keyframe))
+
+    def __len__(self) -> int:
+        return len(self._indexed)
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._indexed
+
+    def describe(self, desc: Words) -> tuple[Ints, ArrayF32]:
+        """The distinct words of descriptors (N, 4), and their shares."""
+        return bag_of_words(self.vocabulary.words(desc), self.vocabulary.idf)
+
+    def add(self, keyframe: int) -> None:
+        """Index a keyframe of the map by its descriptors."""
+        if keyframe in self._indexed:
+            return
+        words, shares = self.describe(self._desc(keyframe))
+        self._make_room(words)
+        insert(keyframe, words, shares, self._lists, self._keyframe_of, self._share_of)
+        self._indexed.add(keyframe)
+
+    def remove(self, keyframe: int) -> None:
+        """Forget a keyframe; one that is not in the index is no error."""
+        if keyframe in self._indexed:
+            words, _ = self.describe(self._desc(keyframe))
+            erase(keyframe, words, self._lists, self._keyframe_of, self._share_of)
+            self._indexed.discard(keyframe)
+
+    def similarity(self, desc: Words) -> tuple[ArrayF32, Ints]:
+        """Similarity in [0, 1] of descriptors (N, 4) to every keyframe of the map, and their distinct common words."""
+        words, shares = self.describe(desc)
+        return compare(words, shares, self._lists, self._keyframe_of, self._share_of, len(self.map.keyframes))
+
+    def candidates(self, desc: Words, excluded: AnyArray | None = None, min_score: float = 0.0, limit: int = 5) -> Ints:
+        """Keyframes that look most like descriptors (N, 4), the best of each place, best place first.
+
+        excluded : keyframes that are no answer; min_score : similarity below which none is.
+        A place is a keyframe with its covisible ones: one image may look alike by chance, a neighbourhood less so.
+        Source: science note B2.
+        """
+        score, common = self.similarity(desc)
+        if excluded is not None:
+            score[excluded], common[excluded] = 0.0, 0
+        if not common.any():
+            return np.zeros(0, np.int32)
+        similar: Bools = (common >= COMMON_WORDS * common.max()) & (score > 0.0) & (score >= min_score)
+        chosen = np.flatnonzero(similar)
+        chosen = chosen[np.argsort(-score[chosen], kind="stable")][:GROUPS_LOOKED_AT]
+        groups = [self._group(int(k), score, similar) for k in chosen]
+        return _best_of_groups(groups, limit)
+
+    def _group(self, keyframe: int, score: ArrayF32, similar: Bools) -> tuple[float, int]:
+        """Score of a keyframe together with its covisible ones, and the best of them."""
+        around, _ = self.map.covisible(keyframe)
+        members = np.sort(np.append(around[:GROUP_SIZE], keyframe))
+        members = members[similar[members]]
+        return float(score[members].sum()), int(members[np.argmax(score[members])])
+
+    def _desc(self, keyframe: int) -> Words:
+        desc: Words = self.map.features.desc[self.map.feature_range(keyframe)]
+        return desc
+
+    def _make_room(self, words: Ints) -> None:
+        full = self._lists[words, 1] == self._lists[words, 2]
+        needed = self._end + int(np.maximum(4, 2 * self._lists[words[full], 2]).sum())
+        if needed > len(self._keyframe_of):
+            self._keyframe_of = _grown(self._keyframe_of, needed)
+            self._share_of = _grown(self._share_of, needed)
+        self._end = enlarge(words, self._end, self._lists, self._keyframe_of, self._share_of)
+
+
+def _grown(column: AnyArray, needed: int) -> AnyArray:
+    out = np.zeros(max(needed, len(column) + len(column) // 4), column.dtype)
+    out[: len(column)] = column
+    return out
+
+
+def _best_of_groups(groups: list[tuple[float, int]], limit: int) -> Ints:
+    best = max((score for score, _ in groups), default=0.0)
+    kept: list[int] = []
+    for score, keyframe in sorted(groups, key=lambda g: (-g[0], g[1])):
+        if score >= GROUP_SCORE * best and keyframe not in kept:
+            kept.append(keyframe)
+    return np.array(kept[:limit], np.int32)
