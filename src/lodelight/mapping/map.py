@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
@@ -52,7 +53,18 @@ class Map:
         )  # fmt: skip
         self.loops = Table(a=(i32, ()), b=(i32, ()), R=(f64, (3, 3)), p=(f64, (3,)))
 
+    def save(self, path: str | Path) -> None:
+        """Write the map file; see `lodelight.mapping.store.save_map`."""
+        from lodelight.mapping.store import save_map
+
+        save_map(self, path)
+
     # -- what is there ------------------------------------------------------------------------------------------
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """All tables by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Table)}
 
     @property
     def alive_keyframes(self) -> Ints:
