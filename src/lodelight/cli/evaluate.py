@@ -41,7 +41,7 @@ def _read(path: Path) -> Trajectory:
 
     if not path.is_dir():
         return read_trajectory(path)
-    from lodelight import open_source
+    from lodelight.io.sources import open_source
 
     truth = open_source(path).ground_truth()
     if truth is None:

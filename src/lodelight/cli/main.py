@@ -1,7 +1,7 @@
 """`lodelight`: finds the command, runs it, and turns what went wrong into one line and an exit status.
 
-A command is a module with `app = typer.Typer(add_completion=False)`, named in COMMANDS. `lodelight --help` imports none of them; a
-command's module is imported when it runs, and imports numpy and heavier things inside its function.
+A command is a module with `app = typer.Typer(add_completion=False)`, named in COMMANDS. `lodelight --help` imports
+none of them; a command's module is imported when it runs, and imports numpy and heavier things inside its function.
 """
 
 from __future__ import annotations

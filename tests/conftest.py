@@ -1,0 +1,21 @@
+"""What several test files need."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# Small dense algebra: one BLAS thread is faster, and its bytes repeat. Before numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def shared_data(name: str) -> Path:
+    """A real recording beside the checkout; the test skips where it is not there."""
+    path = SHARED_DATA / name
+    if not path.exists():
+        pytest.skip(f"needs the recording {name}, expected in {path}")
+    return path
