@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from lodelight.errors import SourceError
 from lodelight.io.depth import DepthReader
 from lodelight.io.pictures import BadFrame, read_grey, read_raw
-from lodelight.io.recording import Recording, Shot
-from lodelight.io.stamps import NS_PER_S, increasing
+from lodelight.io.recording import Recording, Shot, Skipped
+from lodelight.io.stamps import NS_PER_S, increasing, ns_from_text
+from lodelight.io.text import read_table
 from lodelight.messages import Frame, Imu
 from lodelight.rig import CameraSpec, Rig
 from lodelight.trajectory import Trajectory
@@ -27,20 +28,38 @@ class Listing:
 
     t_ns : (N,) stamps of camera 0; images : per camera N paths, None where it took none
     depth : N paths, None where there is none near enough in time; None without a depth sensor
+    bad : rows of the lists that name no frame
     """
 
     t_ns: NDArray[np.int64]
     images: tuple[list[Path | None], ...]
     depth: list[Path | None] | None = None
+    bad: tuple[Skipped, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class ImuTable:
-    """Inertial samples in the body frame. t_ns : (N,); gyro : (N, 3) rad/s; accel : (N, 3) m/s^2."""
+    """Inertial samples in the body frame. t_ns : (N,) increasing; gyro : (N, 3) rad/s; accel : (N, 3) m/s^2."""
 
     t_ns: NDArray[np.int64]
     gyro: Array
     accel: Array
+    bad: tuple[Skipped, ...] = ()
+
+    @staticmethod
+    def read(path: Path) -> ImuTable:
+        """Rows of t_ns, gyro, accel as in EuRoC's `imu0/data.csv`; unusable ones are told in `bad`."""
+        table = read_table(path, 6, ns_from_text)
+        keep = increasing(table.t_ns)
+        bad = [Skipped(int(t), str(path), "IMU stamp is a duplicate or out of order") for t in table.t_ns[~keep]]
+        return ImuTable(
+            table.t_ns[keep], table.values[keep, :3], table.values[keep, 3:], (*bad_rows(path, table.bad), *bad)
+        )
+
+
+def bad_rows(path: Path, numbers: Iterable[int]) -> tuple[Skipped, ...]:
+    """What to tell of lines that could not be read."""
+    return tuple(Skipped(None, f"{path} line {number}", "row cannot be read") for number in numbers)
 
 
 class ListedRecording(Recording):
@@ -66,7 +85,7 @@ class ListedRecording(Recording):
             depth=rig.depth if listing.depth is not None else None,
             imu=rig.imu if imu is not None else None,
         )
-        super().__init__(path, format, rig)
+        super().__init__(path, format, rig, listing.bad + (imu.bad if imu else ()))
         self._listing = listing
         self._keep = increasing(listing.t_ns)
         self._imu_table = imu

@@ -28,9 +28,9 @@ CAMERAS = {"mono": 1, "stereo": 2, "rgbd": 1}
 
 @dataclass(frozen=True)
 class Skipped:
-    """A frame that was left out: its stamp (the reader's clock), the file it came from, and why."""
+    """A frame, or a row of a list, that was left out: its file, why, and its stamp where it has one."""
 
-    t_ns: int
+    t_ns: int | None
     where: str
     reason: str
 
@@ -48,15 +48,16 @@ class Recording(ABC):
     """A recording that is read as a stream.
 
     name : of its folder or file; format : "euroc", "tum_rgbd", ...; rig : only of sensors the recording has
-    skipped : the single frames the last `messages` left out so far
+    skipped : what the last `messages` left out so far; before that, the rows that were no use on opening
     """
 
-    def __init__(self, path: Path, format: str, rig: Rig) -> None:
+    def __init__(self, path: Path, format: str, rig: Rig, bad_rows: tuple[Skipped, ...] = ()) -> None:
         self.path = path
         self.name = path.resolve().name
         self.format = format
         self.rig = rig
-        self.skipped: list[Skipped] = []
+        self.skipped = list(bad_rows)
+        self._bad_rows = bad_rows
 
     @property
     @abstractmethod
@@ -89,8 +90,8 @@ class Recording(ABC):
         """Frames and IMU samples in the order of their stamps, an IMU sample before the frame of the same stamp.
 
         sensors : "mono", "stereo" or "rgbd", each also with "-inertial"
-        start_s, end_s : seconds from the first frame; IMU samples one beyond either end come too, and at
-            start_s = 0 all that precede the first frame
+        start_s, end_s : seconds from the first frame. IMU samples reach one beyond the first and the last frame,
+            so that both can be interpolated to; at start_s = 0 all that precede the first frame come
         Stamps have the rig's time offsets added: they are on the body's clock.
         Raises ConfigError on unknown sensors, SourceError on ones the recording lacks or when no frame is usable.
         """
@@ -100,11 +101,11 @@ class Recording(ABC):
         rig = self.rig
         if CAMERAS[base] > len(rig.cameras) or (base == "rgbd" and not rig.depth) or (suffix and not rig.imu):
             raise SourceError(f"{self.path} cannot serve {sensors}; the most it can is {rig.sensors}")
-        self.skipped = []
+        self.skipped = list(self._bad_rows)
         offset_ns = round(rig.cameras[0].time_offset_s * NS_PER_S)
-        first_ns = self.span_ns[0] + offset_ns
+        first_ns, last_ns = (t_ns + offset_ns for t_ns in self.span_ns)
         low = first_ns + start_s * NS_PER_S if start_s > 0 else -math.inf
-        high = first_ns + end_s * NS_PER_S
+        high = min(first_ns + end_s * NS_PER_S, last_ns)
         frames = self._frames(CAMERAS[base], base == "rgbd", offset_ns, low, high)
         return self._woven(frames, self._imu(low, high)) if suffix else frames
 
@@ -159,10 +160,10 @@ class Recording(ABC):
 
 
 def summarize(skipped: list[Skipped]) -> str:
-    """One line: how many frames were left out for which reasons, with the first file of each."""
+    """One line: how many were left out for which reasons, with the first file of each."""
     if not skipped:
-        return "no frame skipped"
+        return "nothing skipped"
     first = {item.reason: item.where for item in reversed(skipped)}
     counts = Counter(item.reason for item in skipped)
     reasons = "; ".join(f"{n}x {reason} (first: {first[reason]})" for reason, n in counts.most_common(4))
-    return f"{len(skipped)} frame{'s' if len(skipped) > 1 else ''} skipped: {reasons}"
+    return f"{len(skipped)} skipped: {reasons}"

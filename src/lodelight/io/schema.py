@@ -14,7 +14,10 @@ from lodelight.types import Array
 
 
 class Section:
-    """One table of a file. `where` is its path for messages: `rig.toml: camera[0]`."""
+    """One table of a file. `where` is its path for messages: `rig.toml: camera[0]`.
+
+    Every reader of a key raises CalibrationError where it is missing or not what it must be.
+    """
 
     def __init__(self, data: Any, where: str) -> None:
         if not isinstance(data, dict):
@@ -80,14 +83,27 @@ class Section:
             raise CalibrationError(f"{self.at(key)} must be a width and a height in px, not {_shown(self.data[key])}")
         return int(width), int(height)
 
-    def motion(self, key: str) -> SE3:
-        """A rigid motion from four (or three) rows of four."""
+    def matrix(self, key: str) -> Array:
+        """A matrix of finite numbers, as rows of numbers or as `rows`, `cols`, `data` (EuRoC, ROS, OpenCV)."""
         value = self.value(key)
+        if isinstance(value, dict):
+            inner = self.table(key)
+            shape = int(inner.number("rows", minimum=0)), int(inner.number("cols", minimum=0))
+            data = np.array(inner.numbers("data"))
+            if data.size != shape[0] * shape[1]:
+                raise CalibrationError(f"{inner.at('data')} has {data.size} numbers, not {shape[0]} x {shape[1]}")
+            return data.reshape(shape)
         try:
             matrix = np.array(value, dtype=np.float64)
         except (ValueError, TypeError):
             matrix = np.empty(0)
-        return rigid_motion(matrix, self.at(key))
+        if matrix.ndim != 2 or not np.isfinite(matrix).all():
+            raise CalibrationError(f"{self.at(key)} must be a matrix of finite numbers, row by row")
+        return matrix
+
+    def motion(self, key: str) -> SE3:
+        """A rigid motion from a 4x4 or 3x4 matrix."""
+        return rigid_motion(self.matrix(key), self.at(key))
 
     def only_known(self) -> None:
         """Raises on a key that nothing has asked for."""

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lodelight.errors import SourceError
-from lodelight.io import sevenscenes, tum_rgbd
+from lodelight.io import euroc, sevenscenes, tum_rgbd
+from lodelight.io.calibrations import load_rig
 from lodelight.io.recording import Recording
-from lodelight.io.rig_toml import read_rig
 from lodelight.rig import Rig
 
 FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path, Rig | None], Recording]], ...] = (
+    (euroc.recognize, euroc.open_euroc),
     (tum_rgbd.recognize, tum_rgbd.open_tum_rgbd),
     (sevenscenes.recognize, sevenscenes.open_sevenscenes),
 )
@@ -27,9 +28,11 @@ def open_source(path: str | Path, rig: Rig | str | Path | None = None) -> Record
     path = Path(path)
     if not path.exists():
         raise SourceError(f"recording {path} does not exist")
+    if path.name == "mav0":  # the recording is the folder around it
+        path = path.resolve().parent
     if rig is None and (path / "rig.toml").is_file():
         rig = path / "rig.toml"
-    known = read_rig(rig) if isinstance(rig, str | Path) else rig
+    known = load_rig(rig) if isinstance(rig, str | Path) else rig
     for recognize, read in FORMATS:
         if recognize(path):
             return read(path, known)

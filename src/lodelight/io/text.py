@@ -70,15 +70,37 @@ def read_table(path: Path, columns: int, stamp: Callable[[str], int]) -> Table:
     return Table(np.array(t_ns, dtype=np.int64), np.array(values).reshape(-1, columns), tuple(bad))
 
 
+def read_files(path: Path, stamp: Callable[[str], int]) -> tuple[NDArray[np.int64], list[str], tuple[int, ...]]:
+    """Rows of a stamp and a file name: stamps (N,), names, and the numbers of the lines that are not such rows."""
+    t_ns: list[int] = []
+    names: list[str] = []
+    bad: list[int] = []
+    for number, line in lines(path):
+        found = fields(line)
+        try:
+            t, name = stamp(found[0]), found[1]
+        except (ValueError, IndexError):
+            bad.append(number)
+            continue
+        t_ns.append(t)
+        names.append(name)
+    return np.array(t_ns, dtype=np.int64), names, tuple(bad)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write the whole file or leave what was there: a reader never meets half of it."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write the whole file or leave what was there; SourceError where that fails."""
     path = Path(path)
     temporary = ""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", newline="\n", dir=path.parent, delete=False) as file:
+        with tempfile.NamedTemporaryFile("wb", dir=path.parent, delete=False) as file:
             temporary = file.name
-            file.write(text)
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)  # a temporary file is private; what it becomes is not

@@ -8,15 +8,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from lodelight.errors import CalibrationError, SourceError
+from lodelight.errors import CalibrationError
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
-from lodelight.io.listing import ListedRecording, Listing
+from lodelight.io.listing import ListedRecording, Listing, bad_rows
 from lodelight.io.stamps import associate, ns_from_seconds
-from lodelight.io.text import fields, lines, read_text
+from lodelight.io.text import read_files, read_text
 from lodelight.io.trajectories import read_trajectory
 from lodelight.rig import CameraSpec, DepthSpec, Rig
 from lodelight.trajectory import Trajectory
@@ -46,28 +43,16 @@ def recognize(path: Path) -> bool:
 
 def open_tum_rgbd(path: Path, rig: Rig | None) -> ListedRecording:
     """Colour and depth are paired by stamp within 20 ms, the closest pairs first, each depth image used once."""
-    t_rgb, rgb = _read_list(path, "rgb.txt")
+    t_rgb, rgb, bad = read_files(path / "rgb.txt", ns_from_seconds)
+    unread = bad_rows(path / "rgb.txt", bad)
     depth: list[Path | None] | None = None
     if (path / "depth.txt").is_file():
-        t_depth, depth_files = _read_list(path, "depth.txt")
+        t_depth, files, bad = read_files(path / "depth.txt", ns_from_seconds)
+        unread += bad_rows(path / "depth.txt", bad)
         partner = associate(t_rgb, t_depth, TOLERANCE_NS)
-        depth = [depth_files[j] if j >= 0 else None for j in partner.tolist()]
-    listing = Listing(t_rgb, ([*rgb],), depth)
+        depth = [path / files[j] if j >= 0 else None for j in partner.tolist()]
+    listing = Listing(t_rgb, ([path / name for name in rgb],), depth, unread)
     return ListedRecording(path, FORMAT, rig or _built_in_rig(path), listing, truth=lambda: _truth(path))
-
-
-def _read_list(path: Path, name: str) -> tuple[NDArray[np.int64], list[Path]]:
-    """Stamps and files of a list; a line that is not `seconds file` is an error, files are looked at later."""
-    t_ns: list[int] = []
-    files: list[Path] = []
-    for number, line in lines(path / name):
-        found = fields(line)
-        try:
-            t_ns.append(ns_from_seconds(found[0]))
-            files.append(path / found[1])
-        except (ValueError, IndexError):
-            raise SourceError(f"{path / name} line {number}: expected `seconds file`, got {line[:60]!r}") from None
-    return np.array(t_ns, dtype=np.int64), files
 
 
 def _built_in_rig(path: Path) -> Rig:
