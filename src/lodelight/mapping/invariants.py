@@ -13,7 +13,7 @@ ROTATION_TOLERANCE = 1e-6
 
 
 def problems(map: Map) -> list[str]:
-    """Everything that does not hold, one line each: what, how many, the first rows of it."""
+    """Everything that does not hold, one line each: what, and its first rows."""
     return structure(map) or [*_keyframes(map), *_features(map), *_points(map), *_numbers(map)]
 
 
@@ -26,7 +26,8 @@ def _some(what: str, wrong: Bools) -> list[str]:
     rows = np.flatnonzero(wrong)
     if not len(rows):
         return []
-    return [f"{len(rows)} {what}: {', '.join(str(row) for row in rows[:5])}{', ...' if len(rows) > 5 else ''}"]
+    more = f", ... ({len(rows)} in all)" if len(rows) > 5 else ""
+    return [f"{what}: {', '.join(str(row) for row in rows[:5])}{more}"]
 
 
 def _ranges(map: Map) -> list[str]:
@@ -90,8 +91,10 @@ def _in_cycle(successor: AnyArray) -> Bools:
 
 def _keyframes(map: Map) -> list[str]:
     k = map.keyframes
-    off = np.abs(np.swapaxes(k.R, 1, 2) @ k.R - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rotation = (off <= ROTATION_TOLERANCE) & (np.linalg.det(k.R) > 0.0)
+    with np.errstate(invalid="ignore"):
+        off = np.abs(np.swapaxes(k.R, 1, 2) @ k.R - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    rotation = off <= ROTATION_TOLERANCE
+    rotation[rotation] = np.linalg.det(k.R[rotation]) > 0.0
     roots = k.alive & (k.parent < 0)
     return [
         *_some("keyframes whose R is no rotation", k.alive & ~rotation),
