@@ -54,7 +54,8 @@ def room_map(
         features = Features(
             px=px[seen].astype(np.float32), octave=rng.integers(0, 8, n).astype(np.int32),
             angle=rng.uniform(-np.pi, np.pi, n).astype(np.float32), desc=desc[seen],
-            ray=spec.camera.unproject(px[seen])[0], inv_depth=inv_depth, sigma_inv_depth=(0.01 * inv_depth).astype(np.float32),
+            ray=spec.camera.unproject(px[seen])[0], inv_depth=inv_depth,
+            sigma_inv_depth=(0.01 * inv_depth).astype(np.float32),
         )  # fmt: skip
         keyframe = map.add_keyframe(k * 50_000_000 + 7, T_world_body, features, weight=1.0 + 0.1 * k, parent=k - 1)
         rows = np.arange(map.feature_range(keyframe).start, map.feature_range(keyframe).stop, dtype=np.int32)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from lodelight.errors import MapError
+from lodelight.geometry.se3 import SE3
 from lodelight.io.rig_toml import format_rig
 from lodelight.mapping import invariants, store
 from lodelight.mapping.compact import compacted
@@ -98,18 +99,37 @@ def test_save_leaves_out_what_is_dead_and_nothing_else(tmp_path: Path, seed: int
         told = [(new_keyframe[int(map.features.keyframe[r])], *map.features.px[r]) for r in map.observations(int(old))]
         again = [(int(loaded.features.keyframe[r]), *loaded.features.px[r]) for r in loaded.observations(new)]
         assert told == again
-    for new, old in enumerate(points):  # born in the keyframe it was, or in the next that is left
-        left = keyframes[keyframes >= map.points.first_keyframe[old]]
-        assert keyframes[loaded.points.first_keyframe[new]] == (left[0] if len(left) else keyframes[-1])
+    for new, old in enumerate(points):  # born in the keyframe it was, or in its nearest ancestor that is left
+        birth = int(map.points.first_keyframe[old])
+        while not map.keyframes.alive[birth]:
+            birth = int(map.keyframes.parent[birth])
+        assert loaded.points.first_keyframe[new] == new_keyframe[birth]
 
 
-def test_loops_whose_keyframes_are_gone_go_and_others_are_renumbered() -> None:
-    map = room_map(n_keyframes=8)
-    map.loops.append(1, a=2, b=6, R=np.eye(3), p=0.0)
-    map.loops.append(1, a=3, b=7, R=np.eye(3), p=1.0)
-    map.remove_keyframe(2)
+def test_loops_of_culled_keyframes_pass_to_their_ancestors_and_say_the_same() -> None:
+    map = room_map(n_keyframes=9)
+    offset = SE3.exp(np.array([0.01, -0.02, 0.03, 0.05, 0.0, -0.04]))  # a loop is measured, and is not what is believed
+    for a, b in [(3, 7), (2, 3), (4, 8)]:
+        T_a_b = map.pose(a).inverse() @ map.pose(b) @ offset
+        map.loops.append(1, a=a, b=b, R=T_a_b.R, p=T_a_b.t)
+    believed = {k: map.pose(k) for k in range(9)}
+    for keyframe in (6, 3, 7):
+        map.remove_keyframe(keyframe)
     small = compacted(map)
-    assert list(zip(small.loops.a.tolist(), small.loops.b.tolist(), strict=True)) == [(0, 6), (2, 6)]
+    # 3 passes to 2, 7 by 6 to 5: (3, 7) becomes (2, 5), whose new numbers are (2, 4); (2, 3) has nothing left to say
+    assert list(zip(small.loops.a.tolist(), small.loops.b.tolist(), strict=True)) == [(0, 5), (2, 4), (3, 5)]
+    T_2_5 = believed[2].inverse() @ believed[3]
+    T_2_5 = T_2_5 @ (believed[3].inverse() @ believed[7] @ offset) @ (believed[7].inverse() @ believed[5])
+    np.testing.assert_allclose(small.loops.R[1], T_2_5.R, atol=1e-12)  # rounding of a few products
+    np.testing.assert_allclose(small.loops.p[1], T_2_5.t, atol=1e-12)
+
+
+def test_points_and_loops_of_a_root_that_is_gone_are_not_lost_track_of() -> None:
+    map = room_map(n_keyframes=5)
+    map.remove_keyframe(0)
+    small = compacted(map)
+    assert len(small.loops) == 0
+    assert invariants.problems(small) == []
 
 
 def test_keyframes_without_features_keep_their_place() -> None:
@@ -333,13 +353,21 @@ def test_lost_rows_are_found(saved: Path) -> None:
         load_map(saved)
 
 
-def test_a_map_that_would_lead_out_of_its_arrays_is_refused(tmp_path: Path) -> None:
-    map = room_map()
-    map.features.next[3] = len(map.features)
-    save_map(map, tmp_path / "map.lode")
+def test_a_map_that_would_lead_out_of_its_arrays_is_neither_saved_nor_loaded(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    map, earlier = room_map(), saved.read_bytes()
+    map.points.head[3] = -2
+    with pytest.raises(MapError, match="points whose head is no row of features: 3"):
+        save_map(map, saved)
+    assert saved.read_bytes() == earlier
+    with monkeypatch.context() as other_writer:
+        other_writer.setattr(invariants, "structure", lambda map: [])
+        other_writer.setattr(store, "compacted", lambda map: map)
+        save_map(map, saved)
     with pytest.raises(DamagedMap, match="contradicts itself"):
-        load_map(tmp_path / "map.lode")
-    assert check_map(tmp_path / "map.lode") == ["features whose next is no row of features: 3"]
+        load_map(saved)
+    assert check_map(saved) == ["points whose head is no row of features: 3"]
 
 
 # -- columns come and go ----------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ def _keyframes(map: Map) -> list[str]:
     rotation[rotation] = np.linalg.det(k.R[rotation]) > 0.0
     roots = k.alive & (k.parent < 0)
     return [
-        *_some("keyframes whose R is no rotation", k.alive & ~rotation),
+        *_some("keyframes whose R is no rotation", ~rotation),
         *_some("keyframes whose parent is dead", k.alive & (k.parent >= 0) & ~k.alive[k.parent]),
         *(_some("keyframes without a parent, where one is the root of all", roots) if roots.sum() > 1 else []),
     ]
@@ -129,9 +129,8 @@ def _points(map: Map) -> list[str]:
 
 
 def _numbers(map: Map) -> list[str]:
-    """Whatever is alive is made of finite numbers."""
-    alive = {"keyframes": map.keyframes.alive, "points": map.points.alive}
-    alive["features"] = map.keyframes.alive[map.features.keyframe]
+    """Keyframes (a culled one still has a pose) and whatever is alive are made of finite numbers."""
+    alive = {"features": map.keyframes.alive[map.features.keyframe], "points": map.points.alive}
     found = []
     for name, table in map.tables.items():
         counts = alive.get(name, np.ones(len(table), np.bool_))

@@ -43,6 +43,8 @@ def save_map(map: Map, path: str | Path, notes: Mapping[str, str | int | float] 
     """
     path = Path(path)
     with map.lock:
+        if problems := invariants.structure(map):
+            raise MapError(f"the map contradicts itself ({problems[0]}): a bug, please report it; {path} is as it was")
         snapshot = compacted(map)
     try:
         with replacing(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as db:
