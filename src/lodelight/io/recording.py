@@ -37,7 +37,10 @@ class Skipped:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame not decoded yet. `load` may run on another thread, in the order of the shots; it may raise BadFrame."""
+    """A frame not decoded yet.
+
+    load : runs on another thread, in the order of the shots, also after the last shot was given; may raise BadFrame
+    """
 
     t_ns: int
     where: str
@@ -104,8 +107,8 @@ class Recording(ABC):
         self.skipped = list(self._bad_rows)
         offset_ns = round(rig.cameras[0].time_offset_s * NS_PER_S)
         first_ns, last_ns = (t_ns + offset_ns for t_ns in self.span_ns)
-        low = first_ns + start_s * NS_PER_S if start_s > 0 else -math.inf
-        high = min(first_ns + end_s * NS_PER_S, last_ns)
+        low = first_ns + round(start_s * NS_PER_S) if start_s > 0 else -math.inf
+        high = min(first_ns + round(end_s * NS_PER_S), last_ns) if end_s < math.inf else last_ns
         frames = self._frames(CAMERAS[base], base == "rgbd", offset_ns, low, high)
         return self._woven(frames, self._imu(low, high)) if suffix else frames
 
