@@ -14,7 +14,6 @@ from scipy.special import gammaincinv
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
 
-
 CHI2_95_OF_6 = 2.0 * float(gammaincinv(3.0, 0.95))
 
 

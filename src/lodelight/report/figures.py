@@ -1,0 +1,200 @@
+"""The report's plots, as the plain data that plotly.js draws; no colour of text or paper, which the page sets."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any, TypeAlias, get_args
+
+import numpy as np
+
+from lodelight.messages import Status
+from lodelight.report.folder import RunFolder
+from lodelight.types import AnyArray, Array
+
+Figure: TypeAlias = dict[str, Any]
+
+# Enough for a screen; a report of an hour's recording stays as light as one of a minute.
+MAX_SAMPLES = 6000
+MAX_POINTS = 30_000
+
+FINAL, LIVE, TRUTH, SECOND = "#2f7ff0", "#f08a24", "#8a94a3", "#b657d6"
+STATE_COLOURS = {
+    "initializing": "#9aa5b4",
+    "tracking": "#2fa866",
+    "degraded": "#f0b429",
+    "lost": "#e0443e",
+    "relocalized": "#2f7ff0",
+}
+
+
+def packed(values: AnyArray) -> dict[str, str]:
+    """Numbers as plotly.js reads them fastest and smallest: base64 of little-endian floats."""
+    return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")}
+
+
+def thinned(count: int, worst: Array | None = None) -> AnyArray:
+    """Rows to draw of `count`: at most MAX_SAMPLES, evenly spread, of each stretch the one that is worst."""
+    if count <= MAX_SAMPLES:
+        return np.arange(count)
+    edges = np.linspace(0, count, MAX_SAMPLES + 1).astype(int)[:-1]
+    if worst is None:
+        return edges
+    ends = np.append(edges[1:], count)
+    return np.array([a + int(np.argmax(worst[a:b])) for a, b in zip(edges, ends, strict=True)])
+
+
+def line(x: AnyArray, y: AnyArray, name: str, colour: str, **style: Any) -> Figure:
+    trace = {"type": "scatter", "mode": "lines", "name": name, "x": packed(x), "y": packed(y)}
+    return trace | {"line": {"color": colour, "width": 1.5, **style.pop("line", {})}} | style
+
+
+def over_time(traces: list[Figure], y_title: str, **layout: Any) -> Figure:
+    x_axis = {"title": {"text": "time (s)"}}
+    y_axis = {"title": {"text": y_title}, "rangemode": "tozero", **layout.pop("yaxis", {})}
+    return {"data": traces, "layout": {"xaxis": x_axis, "yaxis": y_axis, **layout}, "time": True}
+
+
+def states(run: RunFolder) -> Figure:
+    """A strip: one bar for each stretch of one state."""
+    status = run.frames["status"]
+    t_s = run.seconds(np.array(run.frames["t_ns"], dtype=np.int64))
+    starts = [i for i in range(len(status)) if i == 0 or status[i] != status[i - 1]]
+    ends = [*starts[1:], len(status) - 1]
+    traces = []
+    for state in get_args(Status):
+        bars = [(t_s[a], t_s[b] - t_s[a]) for a, b in zip(starts, ends, strict=True) if status[a] == state]
+        if bars:
+            traces.append(
+                {
+                    **{"type": "bar", "orientation": "h", "name": state, "y": ["state"] * len(bars), "width": 1},
+                    **{"base": [round(b, 4) for b, _ in bars], "x": [round(w, 4) for _, w in bars]},
+                    "marker": {"color": STATE_COLOURS[state], "line": {"width": 0}},
+                    "hovertemplate": "%{base:.2f} s, for %{x:.2f} s<extra>" + state + "</extra>",
+                }
+            )
+    figure = over_time(traces, "", yaxis={"visible": False, "fixedrange": True}, barmode="overlay")
+    return figure
+
+
+def timing(run: RunFolder) -> Figure:
+    t_ns = np.array(run.frames["t_ns"], dtype=np.int64)
+    track, mapping = (np.array(run.frames[name], dtype=float) for name in ("track_ms", "map_ms"))
+    rows = thinned(len(track), track)
+    traces = [line(run.seconds(t_ns[rows]), track[rows], "tracking", FINAL, line={"width": 1})]
+    mapped = np.flatnonzero(mapping > 0)
+    mapped = mapped[thinned(len(mapped), mapping[mapped])]
+    if len(mapped):
+        marks = {"mode": "markers", "marker": {"color": LIVE, "size": 4, "opacity": 0.7}}
+        traces.append(line(run.seconds(t_ns[mapped]), mapping[mapped], "mapping (keyframes)", LIVE, **marks))
+    shapes, notes = [], []
+    for name in ("p50", "p95", "p99"):
+        y = run.metrics["ms_per_frame"][name]
+        if y is not None:
+            across = {"xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y}
+            shapes.append({"type": "line", **across, "line": {"color": TRUTH, "width": 1, "dash": "dot"}})
+            place = {"xref": "paper", "x": 1, "xanchor": "left", "y": y, "yanchor": "middle", "showarrow": False}
+            notes.append({"text": f" {name}", "font": {"color": TRUTH, "size": 11}, **place})
+    return over_time(traces, "ms", shapes=shapes, annotations=notes, margin={"r": 36})
+
+
+def inliers(run: RunFolder) -> Figure:
+    t_ns = np.array(run.frames["t_ns"], dtype=np.int64)
+    count = np.array(run.frames["inliers"], dtype=float)
+    rows = thinned(len(count), -count)
+    return over_time([line(run.seconds(t_ns[rows]), count[rows], "inliers", FINAL)], "map points matched")
+
+
+def sigma(run: RunFolder) -> Figure:
+    t_s = run.seconds(run.sigma_t_ns)
+    rows = thinned(len(t_s), run.sigma_m)
+    cm, deg = 100 * run.sigma_m[rows], run.sigma_deg[rows]
+    traces = [
+        line(t_s[rows], cm, "position (cm)", FINAL),
+        line(t_s[rows], deg, "rotation (deg)", LIVE),
+    ]
+    return over_time(traces, "1 sigma", yaxis={"type": "log", "rangemode": "normal"})
+
+
+def errors_over(run: RunFolder, abscissa: str) -> Figure:
+    """Position error in cm and rotation error in degrees, over time or over the distance travelled."""
+    traces = []
+    for path, name, colour in ((run.live, "live", LIVE), (run.final, "final", FINAL)):
+        e = path.errors
+        if e is None:
+            continue
+        rows = thinned(len(e.t_ns), e.position_m)
+        x = run.seconds(e.t_ns[rows]) if abscissa == "time" else e.along_m[rows]
+        traces.append(line(x, 100 * e.position_m[rows], f"{name}, cm", colour))
+        traces.append(line(x, e.rotation_deg[rows], f"{name}, deg", colour, line={"width": 1, "dash": "dot"}))
+    figure = over_time(traces, "error (cm, deg)")
+    if abscissa != "time":
+        figure["time"] = False
+        figure["layout"]["xaxis"]["title"]["text"] = "distance travelled (m)"
+    return figure
+
+
+def plane(run: RunFolder, axes: str) -> Figure:
+    """The path projected on two world axes, to scale."""
+    i, j = ("xyz".index(axis) for axis in axes)
+    traces = []
+    if run.truth is not None and run.final.alignment is not None:
+        xyz = _during(run.truth.xyz, run.truth.t_ns, run)
+        traces.append(line(xyz[:, i], xyz[:, j], "truth", TRUTH, line={"dash": "dash"}))
+    for path, name, colour, width in ((run.live, "live", LIVE, 1), (run.final, "final", FINAL, 2)):
+        xyz = path.poses.xyz[thinned(len(path.poses))]
+        traces.append(line(xyz[:, i], xyz[:, j], name, colour, line={"width": width}))
+    xyz = keyframes(run)
+    marks = {"mode": "markers", "marker": {"color": FINAL, "size": 5, "symbol": "square-open"}}
+    traces.append(line(xyz[:, i], xyz[:, j], "keyframes", FINAL, **marks))
+    x_axis = {"title": {"text": f"{axes[0]} (m)"}}
+    y_axis = {"title": {"text": f"{axes[1]} (m)"}, "scaleanchor": "x", "scaleratio": 1}
+    return {"data": traces, "layout": {"xaxis": x_axis, "yaxis": y_axis}}
+
+
+def space(run: RunFolder) -> Figure:
+    """Map points, coloured by height, with path and keyframes; far strays are left outside the box."""
+    xyz = run.cloud_xyz[
+        np.linspace(0, len(run.cloud_xyz), min(len(run.cloud_xyz), MAX_POINTS), endpoint=False, dtype=int)
+    ]
+    if run.final.alignment is not None and len(xyz):
+        a = run.final.alignment
+        xyz = a.scale * xyz @ a.R.T + a.t
+    path = run.final.poses.xyz[thinned(len(run.final.poses))]
+    low, high = _box(xyz, path)
+    xyz = xyz[((xyz >= low) & (xyz <= high)).all(axis=1)]
+    marker = {"size": 1.4, "color": packed(xyz[:, 2]), "colorscale": "Viridis", "opacity": 0.8}
+    traces = [
+        {"name": "map points", "mode": "markers", "marker": marker, "hoverinfo": "skip", **_xyz(xyz)},
+        {"name": "path", "mode": "lines", "line": {"color": FINAL, "width": 4}, **_xyz(path)},
+        {"name": "keyframes", "mode": "markers", "marker": {"size": 2.5, "color": LIVE}, **_xyz(keyframes(run))},
+    ]
+    ranges = {f"{axis}axis": {"range": [float(low[k]), float(high[k])]} for k, axis in enumerate("xyz")}
+    return {"data": traces, "layout": {"scene": {"aspectmode": "data", **ranges}, "height": 560}}
+
+
+def keyframes(run: RunFolder) -> Array:
+    """Where the final path was at the keyframes' stamps, (K, 3) m."""
+    stamps = [e["t_ns"] for e in run.events if e.get("kind") == "keyframe" and e.get("insert")]
+    rows = np.flatnonzero(np.isin(run.final.poses.t_ns, np.array(stamps, dtype=np.int64)))
+    return run.final.poses.xyz[rows[thinned(len(rows))]]
+
+
+def _xyz(points: AnyArray) -> Figure:
+    return {"type": "scatter3d", "x": packed(points[:, 0]), "y": packed(points[:, 1]), "z": packed(points[:, 2])}
+
+
+def _box(points: AnyArray, path: Array) -> tuple[Array, Array]:
+    """The path and the middle 98 % of the points in every axis, with a tenth to spare."""
+    corners = [*(np.percentile(points, (1, 99), axis=0) if len(points) else []), *path]
+    if not corners:
+        return -np.ones(3), np.ones(3)
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    spare = 0.1 * (high - low) + 0.05
+    return low - spare, high + spare
+
+
+def _during(xyz: Array, t_ns: AnyArray, run: RunFolder) -> Array:
+    """The truth while the run lasted."""
+    stamps = run.final.poses.t_ns
+    inside = np.flatnonzero((t_ns >= stamps[0]) & (t_ns <= stamps[-1]))
+    return xyz[inside[thinned(len(inside))]]

@@ -1,0 +1,113 @@
+"""An out folder read back: what the report draws."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData
+
+from lodelight.errors import SourceError
+from lodelight.evaluation.align import Alignment, Mode, align
+from lodelight.evaluation.associate import matched
+from lodelight.evaluation.ate import pose_errors
+from lodelight.evaluation.rpe import travelled_m
+from lodelight.io.covariances import read_covariances
+from lodelight.io.trajectories import read_trajectory
+from lodelight.trajectory import Trajectory
+from lodelight.types import Array, ArrayF32
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Error of each matched pose after alignment: stamps (N,) ns, position m, rotation deg, path so far m."""
+
+    t_ns: NDArray[np.int64]
+    position_m: Array
+    rotation_deg: Array
+    along_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Path3D:
+    """A trajectory in the frame that is drawn: the truth's where there is one. `errors` is None without truth."""
+
+    poses: Trajectory
+    alignment: Alignment | None
+    errors: Errors | None
+
+
+@dataclass(frozen=True, eq=False)
+class RunFolder:
+    """frames : columns of `frames.csv`, times in s since the first; events : lines of `events.jsonl`."""
+
+    name: str
+    metrics: dict[str, Any]
+    frames: dict[str, list[str]]
+    events: list[dict[str, Any]]
+    final: Path3D
+    live: Path3D
+    truth: Trajectory | None
+    cloud_xyz: ArrayF32
+    sigma_t_ns: NDArray[np.int64]
+    sigma_m: Array
+    sigma_deg: Array
+
+    def seconds(self, t_ns: NDArray[np.int64]) -> Array:
+        """Stamps as seconds since the first frame."""
+        start = int(self.frames["t_ns"][0]) if self.frames["t_ns"] else 0
+        return (t_ns - start) / 1e9
+
+
+def read_folder(out: Path, truth: Trajectory | None, mode: Mode) -> RunFolder:
+    """Raises SourceError where a file of the folder is missing or not what it should be."""
+    try:
+        metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+        events = [json.loads(line) for line in (out / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+        with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            frames = {name: [row[name] for row in rows] for name in reader.fieldnames or ()}
+        vertex = PlyData.read(str(out / "cloud.ply"))["vertex"]
+        cloud = np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1).astype(np.float32)
+    except (OSError, ValueError, KeyError) as error:
+        raise SourceError(f"{out} is no complete out folder ({error}); run again") from None
+    t_ns, covariances = read_covariances(out / "covariance.csv")
+    variances = np.einsum("nii->ni", covariances)
+    return RunFolder(
+        name=out.resolve().name,
+        metrics=metrics,
+        frames=frames,
+        events=events,
+        final=_placed(_poses(out / "trajectory.tum"), truth, mode),
+        live=_placed(_poses(out / "trajectory_live.tum"), truth, mode),
+        truth=truth,
+        cloud_xyz=cloud,
+        sigma_t_ns=t_ns,
+        sigma_m=np.sqrt(variances[:, 3:].sum(axis=1)),
+        sigma_deg=np.rad2deg(np.sqrt(variances[:, :3].sum(axis=1))),
+    )
+
+
+def _poses(path: Path) -> Trajectory:
+    if not any(not line.startswith("#") for line in path.read_text(encoding="utf-8").splitlines()):
+        return Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+    return read_trajectory(path)
+
+
+def _placed(poses: Trajectory, truth: Trajectory | None, mode: Mode) -> Path3D:
+    try:
+        if truth is None:
+            raise SourceError("no ground truth")
+        ours, true = matched(poses, truth)
+        alignment = align(ours, true, mode)
+    except SourceError:
+        return Path3D(poses, None, None)
+    distance, angle = pose_errors(alignment.apply(ours), true)
+    errors = Errors(ours.t_ns, distance, np.rad2deg(angle), travelled_m(true))
+    return Path3D(alignment.apply(poses), alignment, errors)

@@ -1,0 +1,159 @@
+"""`report.html`: one file that opens from disk, with plotly.js inside and no request to anywhere."""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from lodelight.evaluation.align import Mode
+from lodelight.io.text import read_text, write_text
+from lodelight.report import figures
+from lodelight.report.figures import Figure
+from lodelight.report.folder import RunFolder, read_folder
+from lodelight.trajectory import Trajectory
+
+MAX_EVENTS_OF_A_KIND = 400
+
+
+def write_report(out: Path, truth: Trajectory | None, mode: Mode = "se3") -> Path:
+    """Draw an out folder into `out/report.html`; truth : T_world_body where the source has it.
+
+    Raises SourceError where the folder is not complete or cannot be written.
+    """
+    from plotly.offline import get_plotlyjs
+
+    run = read_folder(out, truth, mode)
+    plots = _plots(run)
+    events, events_note = _events(run)
+    data = {"figures": {name: figure for name, (_, _, _, figure) in plots.items()}, "events": events}
+    page = files("lodelight.report") / "page"
+    document = Template((page / "page.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(run.name),
+        lead=_lead(run),
+        cards="\n".join(_cards(run.metrics)),
+        plots="\n".join(_section(name, *plot[:3]) for name, plot in plots.items()),
+        events_note=events_note,
+        config=html.escape(read_text(out / "config.toml")),
+        css=(page / "page.css").read_text(encoding="utf-8"),
+        js=(page / "page.js").read_text(encoding="utf-8"),
+        plotly=get_plotlyjs(),
+        # a text in the data must not end the script that holds it
+        data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
+    )
+    write_text(out / "report.html", document)
+    return out / "report.html"
+
+
+def _plots(run: RunFolder) -> dict[str, tuple[str, str, bool, Figure]]:
+    """Title, note, whether it takes the page's width, figure."""
+    drawn = {}
+    if run.frames["t_ns"]:
+        drawn["states"] = ("State", "", True, figures.states(run))
+    if len(run.final.poses):
+        drawn["above"] = ("Path, x-y", "From above where z points up.", False, figures.plane(run, "xy"))
+        drawn["side"] = ("Path, x-z", "From the side where z points up.", False, figures.plane(run, "xz"))
+        count = len(run.cloud_xyz)
+        shown = f"{min(count, figures.MAX_POINTS):,} of {count:,} map points" if count else "no map points"
+        drawn["map"] = ("Map", f"{shown}, coloured by z. Drag to turn.", True, figures.space(run))
+    if run.final.errors or run.live.errors:
+        note = "Of each pose, after one alignment of the whole path."
+        drawn["error-time"] = ("Error over time", note, False, figures.errors_over(run, "time"))
+        drawn["error-distance"] = ("Error over distance", note, False, figures.errors_over(run, "distance"))
+    if run.frames["t_ns"]:
+        note = "Tracking: from the decoded image to its pose. Mapping: what a keyframe costs besides."
+        drawn["timing"] = ("Time per frame", note, False, figures.timing(run))
+        drawn["inliers"] = ("Inliers", "Map points that agree with the frame's pose.", False, figures.inliers(run))
+    if len(run.sigma_m):
+        note = "What the system believed of its own error at the time; root of the summed variances."
+        drawn["sigma"] = ("Uncertainty", note, True, figures.sigma(run))
+    return drawn
+
+
+def _section(name: str, title: str, note: str, wide: bool) -> str:
+    below = f'<p class="note">{html.escape(note)}</p>' if note else ""
+    height = {"states": ' style="height:110px"', "map": ' style="height:560px"'}.get(name, "")
+    kind = ' class="wide"' if wide else ""
+    return f'<section{kind}><h2>{html.escape(title)}</h2>{below}<div class="plot" id="{name}"{height}></div></section>'
+
+
+def _lead(run: RunFolder) -> str:
+    t_s = run.seconds(np.array(run.frames["t_ns"], dtype=np.int64))
+    parts = [f"{run.metrics['frames']:,} frames", f"{t_s[-1] if len(t_s) else 0.0:.1f} s"]
+    if len(run.final.poses):
+        parts.append(f"{run.final.poses.length_m:.1f} m of path")
+    return " · ".join(parts)
+
+
+def _cards(m: dict[str, Any]) -> list[str]:
+    cards = []
+    final, live = (m["ate"] or {}).get("final"), (m["ate"] or {}).get("live")
+    if final:
+        more = f"rotation {final['rotation_deg']:.2f}°, {final['align']} aligned"
+        cards.append(_card("Error (ATE RMSE)", f"{100 * final['rmse_m']:.2f} cm", more))
+    if live:
+        more = f"as known at the time; p95 {100 * live['p95_m']:.2f} cm"
+        cards.append(_card("Live error", f"{100 * live['rmse_m']:.2f} cm", more))
+    lost = m["states"]["lost"]
+    cards.append(_card("Tracked", f"{100 * m['tracked_fraction']:.1f} %", f"lost {100 * lost:.1f} % of the frames"))
+    ms = m["ms_per_frame"]
+    if ms["p50"] is not None:
+        more = f"mean {ms['mean']:.1f} · p95 {ms['p95']:.1f} · p99 {ms['p99']:.1f}"
+        cards.append(_card("Median time per frame", f"{ms['p50']:.1f} ms", more))
+    if m["real_time_factor"] is not None:
+        cards.append(_card("Real-time factor", f"{m['real_time_factor']:.2f}", "mapping counted in; below 1 keeps up"))
+    more = f"{m['keyframes']:,} keyframes · {m['loops']} loops · {m['relocalizations']} relocalizations"
+    cards.append(_card("Map points", f"{m['map_points']:,}", more))
+    if any(m["gate"].values()):
+        more = f"{m['gate']['veto']} vetoed · {m['gate']['abstain']} unverified"
+        cards.append(_card("Keyframes the gate passed", f"{m['gate']['pass']}", more))
+    if m["temporary_points"]["created"]:
+        cards.append(
+            _card("Temporary points", f"{m['temporary_points']['created']:,}", f"{m['temporary_points']['left']} left")
+        )
+    if m["peak_rss_mb"] is not None:
+        cards.append(_card("Peak memory", f"{m['peak_rss_mb']:.0f} MB", f"compiling took {m['compile_s']:.1f} s"))
+    return cards
+
+
+def _card(label: str, value: str, more: str) -> str:
+    parts = (("label", label), ("value", value), ("more", more))
+    inner = "".join(f'<div class="{name}">{html.escape(text)}</div>' for name, text in parts)
+    return f'<div class="card">{inner}</div>'
+
+
+def _events(run: RunFolder) -> tuple[list[dict[str, Any]], str]:
+    """Rows of the table, of each kind at most MAX_EVENTS_OF_A_KIND evenly spread, and a line that says so."""
+    by_kind: dict[str, list[int]] = {}
+    for i, event in enumerate(run.events):
+        none = " (none)" if event.get("insert") is False else ""
+        by_kind.setdefault(f"{event['kind']}{none}", []).append(i)
+    rows, cut = [], []
+    for kind, indices in by_kind.items():
+        if len(indices) > MAX_EVENTS_OF_A_KIND:
+            cut.append(f"{MAX_EVENTS_OF_A_KIND} of {len(indices):,} {kind}")
+            indices = [indices[k] for k in np.linspace(0, len(indices) - 1, MAX_EVENTS_OF_A_KIND).astype(int)]
+        for i in indices:
+            event = run.events[i]
+            what = ", ".join(
+                f"{k} {_word(v)}" for k, v in event.items() if k not in ("t_ns", "kind") and v not in ("", None)
+            )
+            t_s = float(run.seconds(np.array(event["t_ns"], dtype=np.int64)))
+            rows.append((i, {"t_s": round(t_s, 3), "kind": kind, "what": what}))
+    shown = f"Shown: {'; '.join(cut)}. " if cut else ""
+    return [row for _, row in sorted(rows, key=lambda r: r[0])], f"{shown}All are in events.jsonl."
+
+
+def _word(value: Any) -> str:
+    return (
+        f"{value:.4g}"
+        if isinstance(value, float)
+        else json.dumps(value)
+        if isinstance(value, list | dict)
+        else str(value)
+    )

@@ -1,0 +1,160 @@
+"""The out folder of a run: events as they happen, everything else at the end.
+
+Same input, same seed, same bytes; wall times stand in `metrics.json`, `frames.csv` and `report.html` alone.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import tomli_w
+
+from lodelight import __version__
+from lodelight.errors import SourceError
+from lodelight.evaluation.align import Mode
+from lodelight.io.clouds import write_ply
+from lodelight.io.covariances import write_covariances
+from lodelight.io.text import write_text
+from lodelight.io.trajectories import write_tum
+from lodelight.messages import Estimate
+from lodelight.report.html import write_report
+from lodelight.report.metrics import ate_entry, peak_rss_mb, spread_ms, state_fractions, with_map_stats
+from lodelight.report.plain import json_line, plain
+from lodelight.trajectory import Trajectory
+from lodelight.types import AnyArray
+
+FILES = (
+    *("config.toml", "events.jsonl", "frames.csv", "trajectory.tum", "trajectory_live.tum", "covariance.csv"),
+    *("cloud.ply", "metrics.json", "report.html"),
+)
+
+
+class Outputs:
+    """Owns the out folder from its creation to `finish`; `with Outputs(...)` closes the events on an error.
+
+    config : everything in force, seed included, in tables as TOML has them; what is None is left out
+    An earlier run's files of the same names are removed first. Raises SourceError where the folder cannot be written.
+    """
+
+    def __init__(self, out: Path, config: dict[str, Any]) -> None:
+        self.out = Path(out)
+        self._estimates: list[Estimate] = []
+        self._times_ms: list[tuple[float, float]] = []
+        self._details: list[dict[str, Any]] = []
+        self._lock = threading.Lock()
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+            for name in FILES:
+                (self.out / name).unlink(missing_ok=True)
+            self._events = (self.out / "events.jsonl").open("w", encoding="utf-8", newline="\n")
+        except OSError as error:
+            raise SourceError(f"cannot write {self.out}: {error.strerror}; choose another --out") from None
+        write_text(self.out / "config.toml", tomli_w.dumps(_without_none(plain(config)) | {"versions": versions()}))
+
+    def event(self, t_ns: int, kind: str, **fields: Any) -> None:
+        """One line of `events.jsonl`, on disk when this returns; from any thread."""
+        line = json_line({"t_ns": t_ns, "kind": kind, **fields})
+        try:
+            with self._lock:
+                self._events.write(line)
+                self._events.flush()
+        except OSError as error:
+            raise SourceError(f"cannot write {self.out / 'events.jsonl'}: {error.strerror}; make room") from None
+
+    def frame(self, estimate: Estimate, track_ms: float, map_ms: float, **details: float) -> None:
+        """A frame's estimate as it was at the time; a change of state becomes an event.
+
+        track_ms : from the decoded image to its pose; map_ms : mapping done for this frame, 0 where it was none
+        details : further columns of `frames.csv`
+        """
+        before = self._estimates[-1].status if self._estimates else None
+        if estimate.status != before:
+            self.event(estimate.t_ns, "state", before=before, now=estimate.status, why=estimate.why)
+        self._estimates.append(estimate)
+        self._times_ms.append((track_ms, map_ms))
+        self._details.append(details)
+
+    def finish(
+        self,
+        final: Trajectory,
+        cloud_xyz: AnyArray,
+        map_stats: dict[str, Any],
+        truth: Trajectory | None,
+        *,
+        wall_s: float,
+        compile_s: float,
+        recording_s: float,
+        align: Mode = "se3",
+    ) -> dict[str, Any]:
+        """Write every file and return what `metrics.json` holds.
+
+        final : poses as known at the end; cloud_xyz : (N, 3) m map points
+        map_stats : keyframes, map_points, gate, temporary_points, loops, relocalizations, and what else is worth saying
+        wall_s : of the whole run; compile_s : spent in it on compiling; recording_s : length of what was run
+        align : how the error against the truth is measured (sim3 for a scale that was free)
+        """
+        self.close()
+        localized = [e for e in self._estimates if e.localized]
+        live = Trajectory.from_poses([e.t_ns for e in localized], [e.T_world_body for e in localized])
+        write_tum(self.out / "trajectory.tum", final)
+        write_tum(self.out / "trajectory_live.tum", live)
+        write_covariances(self.out / "covariance.csv", live.t_ns.tolist(), [e.covariance for e in localized])
+        write_text(self.out / "frames.csv", self._frames_csv())
+        write_ply(self.out / "cloud.ply", cloud_xyz)
+        statuses = [e.status for e in self._estimates]
+        metrics: dict[str, Any] = {
+            "frames": len(self._estimates),
+            "tracked_fraction": len(localized) / max(len(self._estimates), 1),
+            **with_map_stats(map_stats),
+            "ms_per_frame": spread_ms([track for track, _ in self._times_ms]),
+            "ms_per_keyframe": spread_ms([mapping for _, mapping in self._times_ms if mapping > 0]),
+            "compile_s": compile_s,
+            "real_time_factor": (wall_s - compile_s) / recording_s if recording_s > 0 else None,
+            "peak_rss_mb": peak_rss_mb(),
+            "states": state_fractions(statuses),
+            "ate": None,
+        }
+        if truth is not None:
+            metrics["ate"] = {"final": ate_entry(final, truth, align), "live": ate_entry(live, truth, align)}
+        metrics = plain(metrics)
+        write_text(self.out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+        write_report(self.out, truth, align)
+        return metrics
+
+    def _frames_csv(self) -> str:
+        extra = sorted({name for details in self._details for name in details})
+        lines = [",".join(["t_ns,status,inliers,track_ms,map_ms", *extra]) + "\n"]
+        for e, (track_ms, map_ms), details in zip(self._estimates, self._times_ms, self._details, strict=True):
+            cells = [f"{details[name]:g}" if name in details else "" for name in extra]
+            lines.append(",".join([f"{e.t_ns},{e.status},{e.inliers},{track_ms:.3f},{map_ms:.3f}", *cells]) + "\n")
+        return "".join(lines)
+
+    def close(self) -> None:
+        self._events.close()
+
+    def __enter__(self) -> Outputs:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def versions() -> dict[str, str]:
+    """What the run was made with."""
+    import cv2
+    import numba
+    import numpy
+
+    modules = {"numpy": numpy, "numba": numba, "opencv": cv2}
+    found = {name: str(module.__version__) for name, module in modules.items()}
+    return {"lodelight": __version__, "python": platform.python_version()} | found
+
+
+def _without_none(table: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no null: a setting that is absent was not set."""
+    return {k: _without_none(v) if isinstance(v, dict) else v for k, v in table.items() if v is not None}
