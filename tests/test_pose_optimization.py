@@ -14,25 +14,21 @@ from lodelight.geometry.se3 import SE3
 
 
 def evaluate(camera, T, X, px, inv_depth):
-    r, J, E = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
-    rows = reprojection(
+    rows, r, *J = reprojection(
         camera.model,
         camera.params,
         T.R,
         T.t,
         T_BODY_CAM.R,
         T_BODY_CAM.t,
-        X,
-        px[0],
-        px[1],
+        *X,
+        *px,
         1.3,
         inv_depth,
         0.02,
-        r,
-        J,
-        E,
+        np.zeros((2, 3)),
     )
-    return rows, r[:rows].copy(), J[:rows].copy()
+    return rows, np.array(r)[:rows], np.array(J)[:rows]
 
 
 @pytest.mark.parametrize("lens", LENSES)

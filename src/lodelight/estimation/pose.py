@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from lodelight.compiled import kernel
-from lodelight.estimation.dense import cholesky, cholesky_solve, spd_inverse
 from lodelight.estimation.factors.pose_prior import add_pose_prior
 from lodelight.estimation.factors.reprojection import CHI2_PX, CHI2_PX_DEPTH, inliers_of, reprojection
 from lodelight.estimation.robust import huber
 from lodelight.geometry.cameras import Camera
+from lodelight.geometry.dense import cholesky, cholesky_solve, matmul, spd_inverse
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp
-from lodelight.types import Array, Bools
+from lodelight.types import AnyArray, Array, Bools
 
 ROUNDS = 4
 ROBUST_ROUNDS = 2
@@ -52,12 +52,12 @@ def optimize_pose(
     T_world_body: SE3,
     T_body_cam: SE3,
     camera: Camera,
-    xyz: Array,
-    px: Array,
-    sigma_px: Array,
-    inv_depth: Array,
-    sigma_inv_depth: Array,
-    information_weight: Array | None = None,
+    xyz: AnyArray,
+    px: AnyArray,
+    sigma_px: AnyArray,
+    inv_depth: AnyArray,
+    sigma_inv_depth: AnyArray,
+    information_weight: AnyArray | None = None,
     prior: tuple[SE3, Array] | None = None,
 ) -> PoseResult:
     """Most likely T_world_body given points of the world seen by camera 0.
@@ -71,9 +71,8 @@ def optimize_pose(
     """
     n = len(xyz)
     mean, information = prior if prior is not None else (T_world_body, np.zeros((6, 6)))
-    R, p = T_world_body.R.copy(), T_world_body.t.copy()
-    chi2, inliers, covariance = _optimize(
-        camera.model, camera.params, R, p, _f64(T_body_cam.R), _f64(T_body_cam.t),
+    R, p, chi2, inliers, covariance = _optimize(
+        camera.model, camera.params, _f64(T_world_body.R), _f64(T_world_body.t), _f64(T_body_cam.R), _f64(T_body_cam.t),
         _f64(xyz), _f64(px), _f64(sigma_px), _f64(inv_depth), _f64(sigma_inv_depth),
         np.ones(n) if information_weight is None else _f64(information_weight),
         _f64(mean.R), _f64(mean.t), _f64(information), prior is not None,
@@ -81,7 +80,7 @@ def optimize_pose(
     return PoseResult(SE3(R, p), covariance, inliers, chi2)
 
 
-def _f64(a: Array) -> Array:
+def _f64(a: AnyArray) -> Array:
     return np.ascontiguousarray(a, dtype=np.float64)
 
 
@@ -96,14 +95,14 @@ def _linearize(
     Comparable: over the observations seen in `before`; one that left the view keeps the cost it had there, so a
     step is neither rewarded for losing points nor stopped by one.
     """
-    r, J, E = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
+    E = np.zeros((2, 3))
     H[:] = 0.0
     g[:] = 0.0
     cost = comparable = 0.0
     for i in range(xyz.shape[0]):
-        rows = reprojection(
-            model, params, R, p, R_body_cam, p_body_cam, xyz[i], px[i, 0], px[i, 1],
-            sigma_px[i], inv_depth[i], sigma_inv_depth[i], r, J, E,
+        rows, r, Ju, Jv, Jd = reprojection(
+            model, params, R, p, R_body_cam, p_body_cam, xyz[i, 0], xyz[i, 1], xyz[i, 2], px[i, 0], px[i, 1],
+            sigma_px[i], inv_depth[i], sigma_inv_depth[i], E,
         )  # fmt: skip
         bound = math.inf if not robust else CHI2_PX_DEPTH if inv_depth[i] > 0.0 else CHI2_PX
         if rows == 0:
@@ -119,13 +118,15 @@ def _linearize(
         if before[i] < math.inf:
             comparable += weight[i] * value
         w *= weight[i]
-        for k in range(rows):
-            J[k, 3], J[k, 4], J[k, 5] = -J[k, 3], -J[k, 4], -J[k, 5]
-            for a in range(6):
-                wj = w * J[k, a]
-                g[a] += wj * r[k]
-                for b in range(a + 1):
-                    H[a, b] += wj * J[k, b]
+        for a in range(6):
+            ju, jv, jd = w * Ju[a], w * Jv[a], w * Jd[a]
+            g[a] += ju * r[0] + jv * r[1] + jd * r[2]
+            for b in range(a + 1):
+                H[a, b] += ju * Ju[b] + jv * Jv[b] + jd * Jd[b]
+    for a in range(3, 6):  # dr/dp = -dr/dX
+        g[a] = -g[a]
+        for b in range(3):
+            H[a, b] = -H[a, b]
     return cost, comparable
 
 
@@ -134,14 +135,13 @@ def _optimize(
     model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array, xyz: Array, px: Array,
     sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, weight: Array,
     R_prior: Array, p_prior: Array, prior_information: Array, has_prior: bool,
-) -> tuple[Array, Bools, Array]:  # fmt: skip
-    """Move R and p to the optimum; returns chi2 (N,), inliers (N,) and covariance (6, 6)."""
+) -> tuple[Array, Array, Array, Bools, Array]:  # fmt: skip
+    """From R and p to the optimum: R, p, chi2 (N,), inliers (N,), covariance (6, 6)."""
     n = xyz.shape[0]
     chi2, trial_chi2 = np.full(n, math.inf), np.empty(n)
     H, g, trial_H, trial_g = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6)
-    active = np.ones(n, np.bool_)
+    active, settled = np.ones(n, np.bool_), False
     for round_ in range(ROUNDS + 1):
-        # the round after the last one only evaluates, for chi2 and information at the result
         robust = round_ < ROBUST_ROUNDS
         cost, _ = _linearize(
             model, params, R, p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth, sigma_inv_depth,
@@ -149,40 +149,39 @@ def _optimize(
         )  # fmt: skip
         if has_prior:
             cost += add_pose_prior(R, p, R_prior, p_prior, prior_information, H, g)
-        if round_ == ROUNDS:
+        if settled or round_ == ROUNDS:  # H and cost now belong to the inliers at the result
             break
         damping = 1e-9
         for _ in range(ITERATIONS):
             L, step = H.copy(), -g
             for a in range(6):
                 L[a, a] += damping * H[a, a] + 1e-12
-            if not cholesky(L):
-                damping = max(100.0 * damping, 1e-6)
-                continue
-            cholesky_solve(L, step)
-            if -np.dot(g, step) < CONVERGED_CHI2:
-                break
-            trial_R, trial_p = R @ so3_exp(step[:3]), p + step[3:]
-            trial_cost, comparable = _linearize(
-                model, params, trial_R, trial_p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth,
-                sigma_inv_depth, weight, active, robust, chi2, trial_chi2, trial_H, trial_g,
-            )  # fmt: skip
-            if has_prior:
-                prior_cost = add_pose_prior(trial_R, trial_p, R_prior, p_prior, prior_information, trial_H, trial_g)
-                trial_cost += prior_cost
-                comparable += prior_cost
-            if comparable <= cost:
-                R[:], p[:], cost = trial_R, trial_p, trial_cost
-                H, trial_H, g, trial_g, chi2, trial_chi2 = trial_H, H, trial_g, g, trial_chi2, chi2
-                damping = max(0.1 * damping, 1e-9)
-            else:
-                damping = max(100.0 * damping, 1e-6)
-        retested = inliers_of(chi2, inv_depth)
-        if not robust and np.all(retested == active):
-            break
-        active = retested
-    inliers = inliers_of(chi2, inv_depth)
-    return chi2, inliers, _covariance(H, cost, inliers, inv_depth, has_prior)
+            gain = 0.0
+            if cholesky(L):
+                cholesky_solve(L, step)
+                for a in range(6):
+                    gain -= g[a] * step[a]
+                if gain < CONVERGED_CHI2:
+                    break
+                trial_R, trial_p = matmul(R, so3_exp(step[:3])), p + step[3:]
+                trial_cost, comparable = _linearize(
+                    model, params, trial_R, trial_p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth,
+                    sigma_inv_depth, weight, active, robust, chi2, trial_chi2, trial_H, trial_g,
+                )  # fmt: skip
+                if has_prior:
+                    extra = add_pose_prior(trial_R, trial_p, R_prior, p_prior, prior_information, trial_H, trial_g)
+                    trial_cost, comparable = trial_cost + extra, comparable + extra
+                if comparable <= cost:
+                    R, p, cost, damping = trial_R, trial_p, trial_cost, max(0.1 * damping, 1e-9)
+                    H, trial_H, g, trial_g, chi2, trial_chi2 = trial_H, H, trial_g, g, trial_chi2, chi2
+                    continue
+            damping = max(100.0 * damping, 1e-6)
+        inliers = inliers_of(chi2, inv_depth)
+        settled = not robust
+        for i in range(n):
+            settled = settled and inliers[i] == active[i]
+        active = inliers
+    return R, p, chi2, active, _covariance(H, cost, active, inv_depth, has_prior)
 
 
 @kernel

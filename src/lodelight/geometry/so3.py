@@ -107,17 +107,30 @@ def so3_log(R: Array) -> Array:
 
 
 @kernel
+def skew_squared(v: Array) -> Array:
+    """skew(v) @ skew(v) = v v^T - |v|^2 I."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = v[i] * v[j]
+    norm2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    for i in range(3):
+        out[i, i] -= norm2
+    return out
+
+
+@kernel
 def right_jacobian(w: Array) -> Array:
     """J_r (3, 3): Exp(w + d) = Exp(w) Exp(J_r d)."""
     theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     W = skew(w)
     if theta2 < 1e-8:
-        near: Array = np.eye(3) - 0.5 * W + W @ W / 6.0
+        near: Array = np.eye(3) - 0.5 * W + skew_squared(w) / 6.0
         return near
     theta = math.sqrt(theta2)
     a = (1.0 - math.cos(theta)) / theta2
     b = (theta - math.sin(theta)) / (theta2 * theta)
-    out: Array = np.eye(3) - a * W + b * (W @ W)
+    out: Array = np.eye(3) - a * W + b * skew_squared(w)
     return out
 
 
@@ -127,12 +140,12 @@ def right_jacobian_inverse(w: Array) -> Array:
     theta2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     W = skew(w)
     if theta2 < 1e-8:
-        near: Array = np.eye(3) + 0.5 * W + W @ W / 12.0
+        near: Array = np.eye(3) + 0.5 * W + skew_squared(w) / 12.0
         return near
     theta = math.sqrt(theta2)
     # (1 + cos)/sin as cot(theta / 2): finite at pi, where 1 + cos and sin both vanish
     b = 1.0 / theta2 - 0.5 / (theta * math.tan(0.5 * theta))
-    out: Array = np.eye(3) + 0.5 * W + b * (W @ W)
+    out: Array = np.eye(3) + 0.5 * W + b * skew_squared(w)
     return out
 
 

@@ -6,6 +6,7 @@ r = (Log(R_mean^T R), p - p_mean), cost r^T information r: the chart of SE3.pert
 import numpy as np
 
 from lodelight.compiled import kernel
+from lodelight.geometry.dense import matmul, transposed
 from lodelight.geometry.so3 import right_jacobian_inverse, so3_log
 from lodelight.types import Array
 
@@ -15,13 +16,19 @@ def add_pose_prior(
     R: Array, p: Array, R_mean: Array, p_mean: Array, information: Array, H: Array, g: Array
 ) -> float:  # fmt: skip
     """Add J^T information J to H (6, 6) and J^T information r to g (6,); returns r^T information r."""
-    w = so3_log(np.ascontiguousarray(R_mean.T) @ R)
-    r = np.empty(6)
-    r[:3] = w
-    r[3:] = p - p_mean
-    J = np.eye(6)
-    J[:3, :3] = right_jacobian_inverse(w)
-    weighted = information @ r
-    H += J.T @ information @ J
-    g += J.T @ weighted
-    return float(r @ weighted)
+    w = so3_log(matmul(transposed(R_mean), R))
+    Jw = right_jacobian_inverse(w)
+    r, J = np.empty(6), np.eye(6)
+    for a in range(3):
+        r[a], r[3 + a] = w[a], p[a] - p_mean[a]
+        for b in range(3):
+            J[a, b] = Jw[a, b]
+    weighted = matmul(transposed(J), information)
+    gained = matmul(weighted, J)
+    cost = 0.0
+    for a in range(6):
+        for b in range(6):
+            H[a, b] += gained[a, b]
+            g[a] += weighted[a, b] * r[b]
+            cost += r[a] * information[a, b] * r[b]
+    return cost

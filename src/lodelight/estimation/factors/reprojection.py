@@ -7,6 +7,8 @@ The third row is there when the observation carries a depth (RGB-D, stereo), tha
 depth, because the noise of a disparity is Gaussian in 1/z and not in z. Derivation: docs/derivations-reprojection.md.
 """
 
+from typing import TypeAlias
+
 import numpy as np
 
 from lodelight.compiled import kernel
@@ -17,18 +19,23 @@ from lodelight.types import Array, Bools
 CHI2_PX = 5.991
 CHI2_PX_DEPTH = 7.815
 
+Row: TypeAlias = tuple[float, float, float, float, float, float]
+ZERO = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
 
 @kernel
 def reprojection(
-    model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array, X: Array,
-    u: float, v: float, sigma_px: float, inv_depth: float, sigma_inv_depth: float, r: Array, J: Array, E: Array,
-) -> int:  # fmt: skip
-    """Whitened residual and Jacobian of one observation; returns its rows, 0 where the camera cannot see the point.
+    model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array,
+    X: float, Y: float, Z: float, u: float, v: float, sigma_px: float, inv_depth: float, sigma_inv_depth: float,
+    E: Array,
+) -> tuple[int, tuple[float, float, float], Row, Row, Row]:  # fmt: skip
+    """Rows (0 where the camera cannot see the point, else 2 or 3), whitened residual r, Jacobian row by row.
 
-    R, p : T_world_body; X (3,) m world; r (3,), J (3, 6) out; E (3, 3) scratch
-    J = [dr/dtheta | dr/dX], right perturbation of R; dr/dp = -dr/dX, since only X - p enters.
+    R, p : T_world_body; X, Y, Z : the point, m world; E (2, 3) scratch
+    A row is [dr/dtheta | dr/dX], right perturbation of R; dr/dp = -dr/dX, since only X - p enters.
+    Tuples and not arrays, because they stay in registers: half the time.
     """
-    dx, dy, dz = X[0] - p[0], X[1] - p[1], X[2] - p[2]
+    dx, dy, dz = X - p[0], Y - p[1], Z - p[2]
     bx = R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz
     by = R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz
     bz = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
@@ -36,35 +43,34 @@ def reprojection(
     x = R_body_cam[0, 0] * ex + R_body_cam[1, 0] * ey + R_body_cam[2, 0] * ez
     y = R_body_cam[0, 1] * ex + R_body_cam[1, 1] * ey + R_body_cam[2, 1] * ez
     z = R_body_cam[0, 2] * ex + R_body_cam[1, 2] * ey + R_body_cam[2, 2] * ez
-    rows = 3 if inv_depth > 0.0 else 2
-    if rows == 3 and z < MIN_DEPTH_M:
-        return 0
     u_pred, v_pred, seen = project_jacobian(model, params, x, y, z, E)
-    if not seen:
-        return 0
-    scale = 1.0 / sigma_px
-    r[0] = (u_pred - u) * scale
-    r[1] = (v_pred - v) * scale
-    r[2] = 0.0
-    if rows == 3:
-        r[2] = (1.0 / z - inv_depth) / sigma_inv_depth
-        E[2, 2] = -1.0 / (z * z * sigma_inv_depth)
-    for i in range(rows):
-        if i == 2:
-            scale = 1.0
-        # m = d r_i / d X_body; then d X_body / dtheta = [X_body]x gives m x X_body, and d X_body / dX = R^T
-        mx = scale * (E[i, 0] * R_body_cam[0, 0] + E[i, 1] * R_body_cam[0, 1] + E[i, 2] * R_body_cam[0, 2])
-        my = scale * (E[i, 0] * R_body_cam[1, 0] + E[i, 1] * R_body_cam[1, 1] + E[i, 2] * R_body_cam[1, 2])
-        mz = scale * (E[i, 0] * R_body_cam[2, 0] + E[i, 1] * R_body_cam[2, 1] + E[i, 2] * R_body_cam[2, 2])
-        J[i, 0] = my * bz - mz * by
-        J[i, 1] = mz * bx - mx * bz
-        J[i, 2] = mx * by - my * bx
-        J[i, 3] = R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz
-        J[i, 4] = R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz
-        J[i, 5] = R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz
-    if rows == 2:
-        J[2] = 0.0
-    return rows
+    if not seen or (inv_depth > 0.0 and z < MIN_DEPTH_M):
+        return 0, (0.0, 0.0, 0.0), ZERO, ZERO, ZERO
+    s = 1.0 / sigma_px
+    ru, rv = (u_pred - u) * s, (v_pred - v) * s
+    Ju = _row(s * E[0, 0], s * E[0, 1], s * E[0, 2], R, R_body_cam, bx, by, bz)
+    Jv = _row(s * E[1, 0], s * E[1, 1], s * E[1, 2], R, R_body_cam, bx, by, bz)
+    if inv_depth > 0.0:
+        Jd = _row(0.0, 0.0, -1.0 / (z * z * sigma_inv_depth), R, R_body_cam, bx, by, bz)
+        return 3, (ru, rv, (1.0 / z - inv_depth) / sigma_inv_depth), Ju, Jv, Jd
+    return 2, (ru, rv, 0.0), Ju, Jv, ZERO
+
+
+@kernel
+def _row(ex: float, ey: float, ez: float, R: Array, R_body_cam: Array, bx: float, by: float, bz: float) -> Row:
+    """One row of the Jacobian from e = dr/dX_cam and X_body."""
+    # m = dr/dX_body; d X_body / dtheta = [X_body]x gives m x X_body, and d X_body / dX = R^T
+    mx = ex * R_body_cam[0, 0] + ey * R_body_cam[0, 1] + ez * R_body_cam[0, 2]
+    my = ex * R_body_cam[1, 0] + ey * R_body_cam[1, 1] + ez * R_body_cam[1, 2]
+    mz = ex * R_body_cam[2, 0] + ey * R_body_cam[2, 1] + ez * R_body_cam[2, 2]
+    return (
+        my * bz - mz * by,
+        mz * bx - mx * bz,
+        mx * by - my * bx,
+        R[0, 0] * mx + R[0, 1] * my + R[0, 2] * mz,
+        R[1, 0] * mx + R[1, 1] * my + R[1, 2] * mz,
+        R[2, 0] * mx + R[2, 1] * my + R[2, 2] * mz,
+    )
 
 
 @kernel

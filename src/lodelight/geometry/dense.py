@@ -1,4 +1,7 @@
-"""Cholesky for matrices of a few rows: no BLAS call, so no threads and the same bytes everywhere."""
+"""Algebra of matrices of a few rows, for kernels.
+
+No BLAS call: no threads, the same bytes everywhere, and none of the seconds that compiling `@` costs.
+"""
 
 import math
 
@@ -6,6 +9,27 @@ import numpy as np
 
 from lodelight.compiled import kernel
 from lodelight.types import Array
+
+
+@kernel
+def matmul(A: Array, B: Array) -> Array:
+    """A @ B."""
+    out = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            for j in range(B.shape[1]):
+                out[i, j] += A[i, k] * B[k, j]
+    return out
+
+
+@kernel
+def transposed(A: Array) -> Array:
+    """A^T as an array of its own, so that `matmul` is compiled for one memory layout only."""
+    out = np.empty((A.shape[1], A.shape[0]))
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[j, i] = A[i, j]
+    return out
 
 
 @kernel
