@@ -85,3 +85,32 @@ def spd_inverse(A: Array) -> tuple[Array, bool]:
             out[i, j] = column[i]
             out[j, i] = column[i]
     return out, True
+
+
+@kernel
+def inverse3(
+    a00: float, a10: float, a11: float, a20: float, a21: float, a22: float
+) -> tuple[float, float, float, float, float, float]:
+    """Lower half of the inverse of a symmetric 3x3 matrix by its Cholesky factor; all zero if it is not definite.
+
+    By the factor and not by cofactors: those lose all digits where an eigenvalue is 1e-8 of the others, as the
+    depth of a point seen under little parallax is.
+    """
+    none = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if not a00 > 0.0:
+        return none
+    i0 = 1.0 / math.sqrt(a00)
+    l10, l20 = a10 * i0, a20 * i0
+    d1 = a11 - l10 * l10
+    if not d1 > 0.0:
+        return none
+    i1 = 1.0 / math.sqrt(d1)
+    l21 = (a21 - l20 * l10) * i1
+    d2 = a22 - l20 * l20 - l21 * l21
+    if not d2 > 0.0:
+        return none
+    i2 = 1.0 / math.sqrt(d2)
+    m10 = -l10 * i0 * i1  # the inverse of the factor, below its diagonal
+    m21 = -l21 * i1 * i2
+    m20 = -(l20 * i0 + l21 * m10) * i2
+    return i0 * i0 + m10 * m10 + m20 * m20, m10 * i1 + m20 * m21, i1 * i1 + m21 * m21, m20 * i2, m21 * i2, i2 * i2
