@@ -104,26 +104,55 @@ class Recording(ABC):
         rig = self.rig
         if CAMERAS[base] > len(rig.cameras) or (base == "rgbd" and not rig.depth) or (suffix and not rig.imu):
             raise SourceError(f"{self.path} cannot serve {sensors}; the most it can is {rig.sensors}")
-        self.skipped = list(self._bad_rows)
-        offset_ns = round(rig.cameras[0].time_offset_s * NS_PER_S)
-        first_ns, last_ns = (t_ns + offset_ns for t_ns in self.span_ns)
-        low = first_ns + round(start_s * NS_PER_S) if start_s > 0 else -math.inf
-        high = min(first_ns + round(end_s * NS_PER_S), last_ns) if end_s < math.inf else last_ns
-        frames = self._frames(CAMERAS[base], base == "rgbd", offset_ns, low, high)
-        return self._woven(frames, self._imu(low, high)) if suffix else frames
+        frames = self.frames(CAMERAS[base], base == "rgbd", start_s, end_s)
+        return self._woven(frames, self.inertial(start_s, end_s)) if suffix else frames
 
-    def _frames(
-        self, cameras: int, depth: bool, offset_ns: int, low: float, high: float
+    def frames(
+        self, cameras: int, depth: bool, start_s: float = 0.0, end_s: float = math.inf
     ) -> Generator[Frame, None, None]:
+        """The frames alone, with the images of that many cameras and with depth if asked; else as `messages`."""
+        self.skipped = list(self._bad_rows)
+        return self._decoded(self.shots(cameras, depth), *self._window(start_s, end_s))
+
+    def inertial(self, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Imu]:
+        """The inertial samples alone, as `messages`."""
+        if self.rig.imu is None:
+            return
+        offset_ns = round(self.rig.imu.time_offset_s * NS_PER_S)
+        first, last = self._window(start_s, end_s)
+        last = min(last, self._on_body_clock(self.span_ns[1]))
+        before: Imu | None = None
+        for raw in self.imu():
+            sample = Imu(raw.t_ns + offset_ns, raw.gyro, raw.accel)
+            if sample.t_ns < first:
+                before = sample
+                continue
+            if before is not None:
+                yield before
+                before = None
+            yield sample
+            if sample.t_ns >= last:
+                return
+
+    def _window(self, start_s: float, end_s: float) -> tuple[float, float]:
+        """Stamps of a stretch counted from the first frame; open towards an end that is not cut."""
+        zero_ns = self._on_body_clock(self.span_ns[0])
+        first = zero_ns + round(start_s * NS_PER_S) if start_s > 0 else -math.inf
+        return first, zero_ns + round(end_s * NS_PER_S) if end_s < math.inf else math.inf
+
+    def _on_body_clock(self, t_ns: int) -> int:
+        return t_ns + round(self.rig.cameras[0].time_offset_s * NS_PER_S)
+
+    def _decoded(self, shots: Iterator[Shot], first: float, last: float) -> Generator[Frame, None, None]:
         def load(shot: Shot) -> Frame | Skipped:
-            t_ns = shot.t_ns + offset_ns
+            t_ns = self._on_body_clock(shot.t_ns)
             try:
                 frame = shot.load()
             except BadFrame as bad:
                 return Skipped(t_ns, shot.where, str(bad))
             return Frame(t_ns, frame.images, frame.depth)
 
-        wanted = (shot for shot in self.shots(cameras, depth) if low <= shot.t_ns + offset_ns <= high)
+        wanted = (shot for shot in shots if first <= self._on_body_clock(shot.t_ns) <= last)
         usable = False
         with closing(prefetch(wanted, load)) as loaded:
             for item in loaded:
@@ -134,22 +163,6 @@ class Recording(ABC):
                     self.skipped.append(item)
         if not usable:
             raise SourceError(self._why_nothing())
-
-    def _imu(self, low: float, high: float) -> Iterator[Imu]:
-        assert self.rig.imu is not None
-        offset_ns = round(self.rig.imu.time_offset_s * NS_PER_S)
-        before: Imu | None = None
-        for raw in self.imu():
-            sample = Imu(raw.t_ns + offset_ns, raw.gyro, raw.accel)
-            if sample.t_ns < low:
-                before = sample
-                continue
-            if before is not None:
-                yield before
-                before = None
-            yield sample
-            if sample.t_ns >= high:
-                return
 
     def _woven(self, frames: Generator[Frame, None, None], imu: Iterator[Imu]) -> Iterator[Message]:
         streams: tuple[Iterator[Message], Iterator[Message]] = (imu, frames)

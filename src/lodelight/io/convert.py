@@ -1,0 +1,98 @@
+"""Any readable recording, trajectory or rig to a writable one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lodelight.errors import SourceError
+from lodelight.io.calibrations import load_rig
+from lodelight.io.euroc_writer import TRUTH, append_image, append_imu, stored_depth, write_sensors
+from lodelight.io.recording import Recording
+from lodelight.io.rig_toml import write_rig
+from lodelight.io.sources import open_source
+from lodelight.io.trajectories import WRITERS, read_trajectory, write_euroc, write_trajectory
+from lodelight.messages import Frame, Imu
+from lodelight.rig import Rig
+
+Progress = Callable[[Iterator[Frame], int], Iterator[Frame]]
+
+
+def convert(
+    source: str | Path,
+    dest: str | Path,
+    rig: str | Path | None = None,
+    start_s: float = 0.0,
+    end_s: float = math.inf,
+    progress: Progress = lambda frames, n: frames,
+) -> Recording | None:
+    """Write `source` as what the name of `dest` ends in.
+
+    `.tum`, `.txt`, `.csv`, `.kitti`: a trajectory, of a file or the truth of a recording; `.toml`: a rig, of a
+    calibration file or of a recording; else an EuRoC folder of a recording, which is returned with what it skipped.
+    progress : wraps the frames and their number
+    """
+    source, dest = Path(source), Path(dest)
+    suffix = dest.suffix.lower()
+    if suffix in WRITERS:
+        truth = read_trajectory(source) if source.is_file() else open_source(source, rig).ground_truth()
+        if truth is None:
+            raise SourceError(f"{source} has no ground truth to write to {dest}")
+        write_trajectory(dest, truth)
+        return None
+    if suffix == ".toml":
+        write_rig(dest, load_rig(source) if source.is_file() and rig is None else open_source(source, rig).rig)
+        return None
+    recording = open_source(source, rig)
+    write_recording(recording, dest, start_s, end_s, progress)
+    return recording
+
+
+def write_recording(
+    recording: Recording,
+    root: Path,
+    start_s: float = 0.0,
+    end_s: float = math.inf,
+    progress: Progress = lambda frames, n: frames,
+) -> None:
+    """An EuRoC folder with all cameras, depth registered to camera 0, IMU and truth of a recording.
+
+    Stamps go onto the body's clock, so that the time offsets of the written rig are 0.
+    """
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise SourceError(f"{root} exists already; remove it or choose another name")
+    rig = _written_rig(recording.rig)
+    folders = write_sensors(root, rig, comment=f"{recording.name}, {recording.format}")
+    names = [f"cam{i}" for i in range(len(rig.cameras))]
+    frames = recording.frames(len(rig.cameras), rig.depth is not None, start_s, end_s)
+    with closing(frames):
+        for frame in progress(frames, recording.n_frames):
+            for name, image in zip(names, frame.images, strict=True):
+                append_image(folders[name], frame.t_ns, image)
+            if rig.depth is not None and frame.depth is not None:
+                append_image(folders["depth0"], frame.t_ns, stored_depth(frame.depth, rig.depth))
+    if rig.imu is not None:
+        _append_samples(folders["imu0"], recording.inertial(start_s, end_s))
+    truth = recording.ground_truth()
+    if truth is not None:
+        write_euroc(folders[TRUTH] / "data.csv", truth)
+
+
+def _written_rig(rig: Rig) -> Rig:
+    cameras = tuple(replace(spec, time_offset_s=0.0) for spec in rig.cameras)
+    depth = rig.depth
+    if depth is not None:
+        depth = replace(depth, camera=cameras[0].camera, T_body_depth=cameras[0].T_body_cam, registered=True)
+    return Rig(cameras, depth=depth, imu=replace(rig.imu, time_offset_s=0.0) if rig.imu else None)
+
+
+def _append_samples(folder: Path, samples: Iterator[Imu]) -> None:
+    listed = list(samples)
+    gyro = np.array([sample.gyro for sample in listed]).reshape(-1, 3)
+    accel = np.array([sample.accel for sample in listed]).reshape(-1, 3)
+    append_imu(folder, np.array([sample.t_ns for sample in listed], dtype=np.int64), gyro, accel)
