@@ -66,6 +66,8 @@ def consistent_turn(angle_a: ArrayF32, angle_b: ArrayF32) -> Bools:
 
     Source: Mur-Artal et al. 2015 describe this rotation histogram.
     """
+    if len(angle_a) == 0:
+        return np.zeros(0, np.bool_)
     turn = (angle_a - angle_b) / (2.0 * np.pi) % 1.0
     bins = np.minimum((turn * _TURN_BINS).astype(int), _TURN_BINS - 1)
     counts = np.bincount(bins, minlength=_TURN_BINS)

@@ -112,3 +112,42 @@ def refresh_points(
         d = math.sqrt(dx * dx + dy * dy + dz * dz)
         d_max[m] = d * scale_factor ** octave[rows[n - 1]]
         d_min[m] = d_max[m] / scale_factor ** (n_levels - 1)
+
+
+@kernel
+def rows_of_points(points: Ints, head: Ints, next_row: Ints, n_obs: Ints) -> Ints:
+    """All feature rows that see the points, point by point."""
+    total = 0
+    for m in points:
+        total += n_obs[m]
+    rows = np.empty(total, np.int32)
+    n = 0
+    for m in points:
+        row = head[m]
+        while row >= 0:
+            rows[n] = row
+            n += 1
+            row = next_row[row]
+    return rows
+
+
+@kernel
+def redundant_share(start: int, stop: int, point: Ints, next_row: Ints, octave: Ints, head: Ints, n_obs: Ints) -> float:
+    """Share of a keyframe's points that at least three other keyframes see at the same or a finer scale."""
+    total = redundant = 0
+    for row in range(start, stop):
+        m = point[row]
+        if m < 0:
+            continue
+        total += 1
+        if n_obs[m] <= 3:
+            continue
+        others = 0
+        at = head[m]
+        while at >= 0:
+            if at != row and octave[at] <= octave[row] + 1:
+                others += 1
+            at = next_row[at]
+        if others >= 3:
+            redundant += 1
+    return redundant / max(total, 1)

@@ -24,8 +24,8 @@ from lodelight.types import AnyArray, Array, Ints
 class Map:
     """Everything a system knows of a building.
 
-    keyframes : t_ns, R (3, 3) and p (3,) m of T_world_body, weight, parent (spanning tree, -1 = root),
-                first_feature, n_features, alive
+    keyframes : t_ns, R (3, 3) and p (3,) m of T_world_body (of T_parent_body once it is culled), weight,
+                parent (spanning tree, -1 = root), first_feature, n_features, alive
     features  : keyframe, px (2,), octave, angle, desc (4,), inv_depth, sigma_inv_depth, point (-1 = none),
                 next (the next feature of the same point, -1 = last)
     points    : xyz (3,) m world, desc (4,), normal (3,) mean viewing direction, d_min, d_max m (where its scale can
@@ -75,8 +75,11 @@ class Map:
         return np.flatnonzero(self.points.alive).astype(np.int32)
 
     def pose(self, keyframe: int) -> SE3:
-        """T_world_body of a keyframe."""
-        return SE3(self.keyframes.R[keyframe].copy(), self.keyframes.p[keyframe].copy())
+        """T_world_body of a keyframe; a culled one moves with its parent."""
+        stored = SE3(self.keyframes.R[keyframe].copy(), self.keyframes.p[keyframe].copy())
+        if self.keyframes.alive[keyframe] or self.keyframes.parent[keyframe] < 0:
+            return stored
+        return self.pose(int(self.keyframes.parent[keyframe])) @ stored
 
     def set_pose(self, keyframe: int, T_world_body: SE3) -> None:
         self.keyframes.R[keyframe] = T_world_body.R
@@ -86,6 +89,14 @@ class Map:
         """The feature rows of a keyframe."""
         start = int(self.keyframes.first_feature[keyframe])
         return slice(start, start + int(self.keyframes.n_features[keyframe]))
+
+    def features_of(self, keyframe: int) -> Features:
+        """The features of a keyframe as the front end gave them."""
+        rows, f = self.feature_range(keyframe), self.features
+        ray, _ = self.rig.cameras[0].camera.unproject(f.px[rows])
+        return Features(
+            f.px[rows], f.octave[rows], f.angle[rows], f.desc[rows], ray, f.inv_depth[rows], f.sigma_inv_depth[rows]
+        )
 
     def points_of(self, keyframe: int) -> Ints:
         """Point of every feature of a keyframe, -1 where there is none; a live view."""
@@ -159,8 +170,10 @@ class Map:
         """Forget a keyframe: its observations go, its children in the spanning tree pass to its parent."""
         rows = np.arange(self.feature_range(keyframe).start, self.feature_range(keyframe).stop, dtype=np.int32)
         self.unlink(rows)
-        kf = self.keyframes
-        kf.parent[kf.parent == keyframe] = kf.parent[keyframe]
+        kf, parent = self.keyframes, int(self.keyframes.parent[keyframe])
+        kf.parent[(kf.parent == keyframe) & kf.alive] = parent
+        if parent >= 0:
+            self.set_pose(keyframe, self.pose(parent).inverse() @ self.pose(keyframe))
         kf.alive[keyframe] = False
 
     def fuse_points(self, old: int, new: int) -> None:

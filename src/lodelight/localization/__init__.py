@@ -1,0 +1,1 @@
+"""Where the camera is in a map: prediction, local map, pose, and finding it again when it was lost."""

@@ -1,0 +1,224 @@
+"""From one frame's features to its pose: predict, match with the last frame, match with the local map, solve twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lodelight.estimation.pose import PoseResult, optimize_pose
+from lodelight.features.features import Features
+from lodelight.features.matching import FeatureIndex, consistent_turn, match_descriptors
+from lodelight.features.orb import OrbConfig
+from lodelight.geometry.pnp import ransac_pnp
+from lodelight.geometry.se3 import SE3
+from lodelight.mapping.map import Map
+from lodelight.mapping.sight import in_sight, local_keyframes, points_of_keyframes
+from lodelight.rig import Rig
+from lodelight.types import AnyArray, Array, ArrayF32, Ints, Words
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """sigma_px : noise of a corner at the finest octave
+    search_px : how far a corner may be from where the motion model puts it, at the finest octave
+    min_matches : fewer that fit a pose, and the next way of matching is tried
+    min_inliers : fewer after the local map, and the frame is lost; good_inliers : fewer, and it is degraded
+    """
+
+    sigma_px: float = 0.8
+    search_px: float = 15.0
+    min_matches: int = 20
+    min_inliers: int = 15
+    good_inliers: int = 40
+
+
+@dataclass(eq=False)
+class Tracked:
+    """A frame and what it was matched with. point : (N,) map point of every feature, -1 = none; inliers only."""
+
+    t_ns: int
+    seen: Features
+    T_world_body: SE3
+    covariance: Array
+    point: Ints
+    reference: int
+    why_lost: str = ""
+    T_reference_body: SE3 = field(default_factory=SE3.identity)
+
+    @property
+    def n_inliers(self) -> int:
+        return int(np.count_nonzero(self.point >= 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Things to match with: map point (M,) or -1, position (M, 3) m world, and how a feature of it looked."""
+
+    point: Ints
+    xyz: Array
+    desc: Words
+    octave: Ints
+    angle: ArrayF32
+
+
+class Tracker:
+    """Follows the camera in a map that others write. Keeps only the last frame and the motion between the last two."""
+
+    def __init__(self, rig: Rig, map: Map, orb: OrbConfig, config: TrackerConfig) -> None:
+        self.map = map
+        self.orb = orb
+        self.config = config
+        self.camera = rig.cameras[0].camera
+        self.T_body_cam = rig.cameras[0].T_body_cam
+        self.last: Tracked | None = None
+        self._motion: tuple[SE3, int] | None = None  # T_previous_last and the time it took, ns
+
+    # -- the loop's two calls -----------------------------------------------------------------------------------
+
+    def track(self, t_ns: int, seen: Features) -> Tracked:
+        """Pose of a frame that follows the last one; `why_lost` says what failed where it is not empty.
+
+        Three ways to a first pose, each tried where the one before found too little: the last frame's points where
+        the motion model puts them, the same by descriptor alone, and the reference keyframe's by descriptor.
+        """
+        assert self.last is not None
+        last = self.last
+        T_world_last = self._moved_with_map(last)
+        predicted = self._predict(T_world_last, t_ns)
+        index = FeatureIndex(seen, self.camera.width, self.camera.height)
+        recent = self._landmarks_of_frame(last, T_world_last)
+        match = self._match_predicted(recent, predicted, index)
+        point, solved = self._fit(predicted, seen, recent, match)
+        if solved.n_inliers < self.config.min_matches:
+            for landmarks in (recent, self._landmarks_of_keyframe(last.reference)):
+                guess, match = self._match_blindly(landmarks, seen)
+                point, solved = self._fit(guess or predicted, seen, landmarks, match)
+                if solved.n_inliers >= self.config.min_matches:
+                    break
+            else:
+                return self._lost(t_ns, seen, predicted, f"{solved.n_inliers} of {len(match)} matches fit one pose")
+        return self.refine(t_ns, seen, solved.T_world_body, point, index, search=3.0)
+
+    def refine(
+        self, t_ns: int, seen: Features, T_world_body: SE3, point: Ints, index: FeatureIndex, search: float
+    ) -> Tracked:
+        """Match the local map around a pose that is nearly right, and solve again.
+
+        point : (N,) matches so far; search : window in units of a corner's own scale
+        """
+        map, orb = self.map, self.orb
+        voting = local_keyframes(map, point)
+        local = points_of_keyframes(map, voting)
+        sight = in_sight(map, local, T_world_body, self.T_body_cam, self.camera, orb)
+        map.points.n_visible[sight.point] += 1
+        new = ~np.isin(sight.point, point[point >= 0])
+        radius = np.where(sight.cosine > 0.998, 2.5, 4.0) * search * orb.scale(sight.octave)
+        match = index.search(
+            sight.px[new], radius[new], (sight.octave[new] - 1, sight.octave[new] + 1),
+            map.points.desc[sight.point[new]], free=point < 0, ratio=0.8,
+        )  # fmt: skip
+        point = point.copy()
+        point[match[match >= 0]] = sight.point[new][match >= 0]
+        used = np.flatnonzero(point >= 0)
+        solved = self._solve(T_world_body, seen.take(used), map.points.xyz[point[used]])
+        point[used[~solved.inliers]] = -1
+        map.points.n_found[point[point >= 0]] += 1
+        reference = int(voting[0]) if len(voting) else self.last.reference if self.last else 0
+        tracked = Tracked(t_ns, seen, solved.T_world_body, solved.covariance, point, reference)
+        if tracked.n_inliers < self.config.min_inliers:
+            tracked.why_lost = f"{tracked.n_inliers} of {len(used)} matches with the local map are inliers"
+        return tracked
+
+    def accept(self, tracked: Tracked) -> None:
+        """Make this the last frame."""
+        last = self.last
+        if last is not None and not last.why_lost and not tracked.why_lost and tracked.t_ns > last.t_ns:
+            T_last_now = self._moved_with_map(last).inverse() @ tracked.T_world_body
+            self._motion = (T_last_now, tracked.t_ns - last.t_ns)
+        else:
+            self._motion = None
+        tracked.T_reference_body = self.map.pose(tracked.reference).inverse() @ tracked.T_world_body
+        self.last = tracked
+
+    # -- parts --------------------------------------------------------------------------------------------------
+
+    def _moved_with_map(self, frame: Tracked) -> SE3:
+        """T_world_body of a past frame, as its reference keyframe has been corrected since."""
+        return self.map.pose(frame.reference) @ frame.T_reference_body
+
+    def _predict(self, T_world_last: SE3, t_ns: int) -> SE3:
+        """Constant velocity, for however long the last frame is ago; no motion where none is known."""
+        if self._motion is None or self.last is None:
+            return T_world_last
+        T_previous_last, dt_ns = self._motion
+        share = (t_ns - self.last.t_ns) / dt_ns
+        return T_world_last @ SE3.exp(share * T_previous_last.log())
+
+    def _landmarks_of_frame(self, frame: Tracked, T_world_body: SE3) -> Landmarks:
+        """What a frame saw: its map points, and features with a depth but no map point, put where that depth says."""
+        seen = frame.seen
+        point = self.map.surviving(frame.point)
+        use = np.flatnonzero((point >= 0) | (seen.inv_depth > 0))
+        seen, point = seen.take(use), point[use]
+        depth = 1.0 / np.where(seen.inv_depth > 0, seen.inv_depth, 1.0)
+        xyz = (T_world_body @ self.T_body_cam) @ (seen.ray * (depth / seen.ray[:, 2])[:, None])
+        xyz[point >= 0] = self.map.points.xyz[point[point >= 0]]
+        return Landmarks(point, xyz, seen.desc, seen.octave, seen.angle)
+
+    def _landmarks_of_keyframe(self, keyframe: int) -> Landmarks:
+        seen, point = self.map.features_of(keyframe), self.map.points_of(keyframe)
+        use = np.flatnonzero(point >= 0)
+        seen, point = seen.take(use), point[use]
+        return Landmarks(point, self.map.points.xyz[point], seen.desc, seen.octave, seen.angle)
+
+    def _match_predicted(self, landmarks: Landmarks, predicted: SE3, index: FeatureIndex) -> Ints:
+        """(M, 2) rows (landmark, feature): nearest descriptors around where the landmarks should appear."""
+        px, inside = self.camera.project((predicted @ self.T_body_cam).inverse() @ landmarks.xyz)
+        use = np.flatnonzero(inside)
+        octave = landmarks.octave[use]
+        radius = self.config.search_px * self.orb.scale(octave)
+        match = index.search(px[use], radius, (octave - 1, octave + 1), landmarks.desc[use], ratio=0.9)
+        return _pairs(use, match, landmarks, index.features)
+
+    def _match_blindly(self, landmarks: Landmarks, seen: Features) -> tuple[SE3 | None, Ints]:
+        """Pose and rows (landmark, feature) that agree with it, by descriptors alone."""
+        everything = np.arange(len(landmarks.point))
+        match = match_descriptors(landmarks.desc, seen.desc, max_hamming=64, ratio=0.8)
+        pairs = _pairs(everything, match, landmarks, seen)
+        sigma_rad = self._sigma_px(seen)[pairs[:, 1]] / self.camera.focal_px
+        found = ransac_pnp(seen.ray[pairs[:, 1]], landmarks.xyz[pairs[:, 0]], sigma_rad, seed=0)
+        if found is None:
+            return None, pairs
+        T_world_cam, inliers = found
+        return T_world_cam @ self.T_body_cam.inverse(), pairs[inliers]
+
+    def _fit(self, start: SE3, seen: Features, landmarks: Landmarks, pairs: Ints) -> tuple[Ints, PoseResult]:
+        """Map point (N,) of every feature that agrees with the pose, and the pose."""
+        solved = self._solve(start, seen.take(pairs[:, 1]), landmarks.xyz[pairs[:, 0]])
+        agreed = pairs[solved.inliers]
+        point = np.full(len(seen), -1, np.int32)
+        point[agreed[:, 1]] = landmarks.point[agreed[:, 0]]
+        return point, solved
+
+    def _solve(self, start: SE3, seen: Features, xyz: Array) -> PoseResult:
+        """Motion-only optimization of features against their world positions (N, 3)."""
+        return optimize_pose(
+            start, self.T_body_cam, self.camera, xyz, seen.px, self._sigma_px(seen),
+            seen.inv_depth, seen.sigma_inv_depth,
+        )  # fmt: skip
+
+    def _sigma_px(self, seen: Features) -> Array:
+        return self.config.sigma_px * self.orb.scale(seen.octave)
+
+    def _lost(self, t_ns: int, seen: Features, T_world_body: SE3, why: str) -> Tracked:
+        nothing = np.full(len(seen), -1, np.int32)
+        reference = self.last.reference if self.last else 0
+        return Tracked(t_ns, seen, T_world_body, np.diag([1.0] * 6), nothing, reference, why_lost=why)
+
+
+def _pairs(rows: AnyArray, match: Ints, landmarks: Landmarks, seen: Features) -> Ints:
+    """(M, 2) of (landmark, feature) from a search's answer for `rows`, those kept whose patches turn alike."""
+    hit = np.flatnonzero(match >= 0)
+    hit = hit[consistent_turn(landmarks.angle[rows[hit]], seen.angle[match[hit]])]
+    return np.stack([rows[hit], match[hit]], axis=1).astype(np.int32)

@@ -1,0 +1,138 @@
+"""Does this frame become a keyframe? Small predicates, each with its reason, and gates beside them.
+
+A frame is inserted if nothing forbids it, its quality asks for it, the time is right, and every gate lets it pass.
+Source: science note A9 (the conditions of ORB-SLAM2's NeedNewKeyFrame, as published).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """max_interval_s : one is inserted after this long even if mapping is busy; min_interval_s : never sooner
+    overlap : the share of the reference keyframe's points above which a frame adds nothing new
+    weak_overlap : the share below which one is inserted whatever the timing (if weak_tracking_override)
+    min_points : with fewer tracked points a frame is not trusted to become one
+    close_low, close_new : few close points tracked, and so many that could be made
+    queue_limit : keyframes that may wait for mapping
+    map_limit : keyframes above which none is inserted within max_interval_s of a relocalization
+    """
+
+    max_interval_s: float = 1.0
+    min_interval_s: float = 0.0
+    overlap: float = 0.75
+    overlap_young: float = 0.4
+    weak_overlap: float = 0.25
+    weak_tracking_override: bool = True
+    min_points: int = 15
+    close_low: int = 100
+    close_new: int = 70
+    queue_limit: int = 3
+    map_limit: int = 30
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What is known of a frame when it is asked whether it becomes a keyframe.
+
+    reference_points : of the reference keyframe, those seen often enough to be expected again
+    close_tracked, close_untracked : features with good depth, with and without a map point
+    """
+
+    t_ns: int
+    inliers: int
+    reference_points: int
+    close_tracked: int
+    close_untracked: int
+    n_keyframes: int
+    since_keyframe_s: float
+    since_relocalization_s: float
+    mapping_idle: bool = True
+    queue: int = 0
+    mapping_stopped: bool = False
+    localization_only: bool = False
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a gate says. PASS with a weight in (0, 1]; VETO; ABSTAIN where it cannot tell: passed, unverified."""
+
+    verdict: Literal["PASS", "VETO", "ABSTAIN"]
+    why: str
+    weight: float = 1.0
+
+
+Gate: TypeAlias = Callable[[Candidate], Verdict]
+
+
+@dataclass(frozen=True)
+class Decision:
+    insert: bool
+    why: str
+    weight: float = 1.0
+
+
+def forbidden(c: Candidate, config: KeyframeConfig) -> str:
+    """Why no frame may become a keyframe now; empty where one may."""
+    if c.localization_only:
+        return "localization only"
+    if c.mapping_stopped:
+        return "local mapping is stopped or the map is being corrected"
+    if c.since_relocalization_s < config.max_interval_s and c.n_keyframes > config.map_limit:
+        return "soon after a relocalization in a large map"
+    return ""
+
+
+def needs_close_points(c: Candidate, config: KeyframeConfig) -> bool:
+    return c.close_tracked < config.close_low and c.close_untracked > config.close_new
+
+
+def too_few_points(c: Candidate, config: KeyframeConfig) -> str:
+    if c.inliers <= config.min_points:
+        return f"{c.inliers} tracked points are too few to trust"
+    return ""
+
+
+def overlap_too_high(c: Candidate, config: KeyframeConfig) -> str:
+    limit = config.overlap_young if c.n_keyframes < 2 else config.overlap
+    if c.inliers >= limit * c.reference_points and not needs_close_points(c, config):
+        return f"{c.inliers} of the reference's {c.reference_points} points still in view"
+    return ""
+
+
+def is_weak(c: Candidate, config: KeyframeConfig) -> bool:
+    """Tracking hangs on few of the reference's points: a keyframe cannot wait."""
+    return c.inliers < config.weak_overlap * c.reference_points or needs_close_points(c, config)
+
+
+def too_early(c: Candidate, config: KeyframeConfig) -> str:
+    if config.weak_tracking_override and is_weak(c, config) and c.queue < config.queue_limit:
+        return ""
+    if c.since_keyframe_s >= config.max_interval_s and c.queue < config.queue_limit:
+        return ""
+    if c.since_keyframe_s >= config.min_interval_s and c.mapping_idle:
+        return ""
+    if c.queue >= config.queue_limit:
+        return f"{c.queue} keyframes wait for mapping"
+    return "mapping is busy and the last keyframe is recent"
+
+
+def decide(c: Candidate, config: KeyframeConfig, gates: tuple[Gate, ...] = ()) -> Decision:
+    """Whether to insert, why, and the weight the gates give: the least of theirs."""
+    for refuses in (forbidden, too_few_points, overlap_too_high, too_early):
+        why = refuses(c, config)
+        if why:
+            return Decision(False, why)
+    weight, reasons = 1.0, []
+    for gate in gates:
+        said = gate(c)
+        if said.verdict == "VETO":
+            return Decision(False, said.why)
+        weight = min(weight, said.weight)
+        reasons.append(said.why)
+    why = "needs close points" if needs_close_points(c, config) else f"{c.inliers} of {c.reference_points} points left"
+    return Decision(True, "; ".join([why, *reasons]), weight)

@@ -1,0 +1,252 @@
+"""Local mapping: what happens to the map when a keyframe enters it.
+
+`insert` is the quick half that tracking waits for: the keyframe and points from its depth. `process` is the rest:
+points that proved bad go, new ones are triangulated with the neighbours, doubles are fused, poses and points of the
+neighbourhood are adjusted together, and keyframes that add nothing go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lodelight.estimation.bundle import BundleProblem, bundle_adjust
+from lodelight.estimation.factors.reprojection import CHI2_PX
+from lodelight.features.epipolar import match_epipolar
+from lodelight.features.features import Features
+from lodelight.features.matching import FeatureIndex
+from lodelight.features.orb import OrbConfig
+from lodelight.geometry.se3 import SE3
+from lodelight.geometry.triangulate import triangulate_pairs
+from lodelight.mapping import kernels
+from lodelight.mapping.map import Map
+from lodelight.mapping.sight import in_sight, points_of_keyframes
+from lodelight.types import AnyArray, Array, Bools, Ints
+
+
+@dataclass(frozen=True)
+class LocalMappingConfig:
+    """sigma_px : noise of a corner at the finest octave
+    close_sigma : a depth this uncertain or better, as a share of itself, makes a point from one keyframe
+    min_close : so many of the best depths make points even where they are worse
+    neighbours : keyframes with which points are triangulated and fused
+    window : keyframes adjusted together; min_shared : points that make a keyframe part of it
+    redundant : share of a keyframe's points that others see as well, above which it is culled
+    found_ratio : a point found in a smaller share of the frames that should see it is culled
+    """
+
+    sigma_px: float = 0.8
+    close_sigma: float = 0.05
+    min_close: int = 100
+    neighbours: int = 8
+    window: int = 20
+    min_shared: int = 15
+    redundant: float = 0.9
+    found_ratio: float = 0.25
+    iterations: int = 5
+
+
+class LocalMapper:
+    """Writes the map. All methods take the map's lock where they change it."""
+
+    def __init__(self, map: Map, orb: OrbConfig, config: LocalMappingConfig) -> None:
+        self.map = map
+        self.orb = orb
+        self.config = config
+        self.camera = map.rig.cameras[0].camera
+        self.T_body_cam = map.rig.cameras[0].T_body_cam
+        self._young: list[tuple[int, Ints]] = []  # keyframe and the points it made, until they have proved themselves
+
+    # -- the two halves -----------------------------------------------------------------------------------------
+
+    def insert(self, t_ns: int, T_world_body: SE3, seen: Features, point: Ints, weight: float, parent: int) -> int:
+        """A keyframe with its matches (N,) and new points from its depth; returns its id."""
+        map = self.map
+        keyframe = map.add_keyframe(t_ns, T_world_body, seen, weight, parent)
+        first = map.feature_range(keyframe).start
+        point = map.surviving(point)
+        matched = np.flatnonzero(point >= 0)
+        map.link(first + matched, point[matched])
+        map.refresh_points(point[matched], self.orb.scale_factor, self.orb.n_levels)
+        fresh = np.flatnonzero((point < 0) & self.close(seen))
+        xyz = (T_world_body @ self.T_body_cam) @ points_at_depth(seen.take(fresh))
+        made = map.add_points(xyz, (first + fresh).astype(np.int32), keyframe)
+        map.refresh_points(made, self.orb.scale_factor, self.orb.n_levels)
+        self._young.append((keyframe, made))
+        return keyframe
+
+    def process(self, keyframe: int, stop: Callable[[], bool] | None = None) -> None:
+        """The slow half. `stop` is asked between the iterations of the adjustment."""
+        with self.map.lock:
+            self._cull_young_points(keyframe)
+            self._triangulate(keyframe)
+            self._fuse(keyframe)
+        self._adjust(keyframe, stop)
+        with self.map.lock:
+            self._cull_keyframes(keyframe)
+
+    def close(self, seen: Features) -> Bools:
+        """Which features have a depth good enough to make a point of it, or are among the best `min_close`."""
+        relative = np.where(seen.inv_depth > 0, seen.sigma_inv_depth / np.maximum(seen.inv_depth, 1e-9), np.inf)
+        good: Bools = relative < self.config.close_sigma
+        if np.count_nonzero(good) < self.config.min_close:
+            best = np.argsort(relative, kind="stable")[: self.config.min_close]
+            good[best[np.isfinite(relative[best])]] = True
+        return good
+
+    # -- parts --------------------------------------------------------------------------------------------------
+
+    def _cull_young_points(self, keyframe: int) -> None:
+        p, kept = self.map.points, []
+        for born, points in self._young:
+            points = points[p.alive[points]]
+            age = keyframe - born
+            bad = p.n_found[points] < self.config.found_ratio * p.n_visible[points]
+            if age >= 2:
+                has_depth = self.map.features.inv_depth[p.head[points]] > 0
+                bad |= p.n_obs[points] < np.where(has_depth, 2, 3)
+            self.map.remove_points(points[bad])
+            if age < 3:
+                kept.append((born, points[~bad]))
+        self._young = kept
+
+    def _triangulate(self, keyframe: int) -> None:
+        """New points from features that no point explains yet, matched along epipolar planes with neighbours."""
+        map = self.map
+        here = map.features_of(keyframe)
+        made = []
+        for other in self._neighbours(keyframe):
+            free = np.flatnonzero(map.points_of(keyframe) < 0)
+            there = map.features_of(other)
+            free_there = np.flatnonzero(map.points_of(other) < 0)
+            if len(free) == 0 or len(free_there) == 0:
+                continue
+            a, b = here.take(free), there.take(free_there)
+            T_world_a = map.pose(keyframe) @ self.T_body_cam
+            T_world_b = map.pose(other) @ self.T_body_cam
+            sigma_a, sigma_b = self._sigma_rad(a.octave), self._sigma_rad(b.octave)
+            match = match_epipolar(a, b, T_world_b.inverse() @ T_world_a, sigma_b)
+            ia = np.flatnonzero(match >= 0)
+            ib = match[ia]
+            xyz, good = triangulate_pairs(T_world_a, a.ray[ia], sigma_a[ia], T_world_b, b.ray[ib], sigma_b[ib])
+            row_a = (map.feature_range(keyframe).start + free[ia[good]]).astype(np.int32)
+            row_b = (map.feature_range(other).start + free_there[ib[good]]).astype(np.int32)
+            points = map.add_points(xyz[good], row_a, keyframe)
+            map.link(row_b, points)
+            map.refresh_points(points, self.orb.scale_factor, self.orb.n_levels)
+            made.append(points)
+        if made:
+            self._young.append((keyframe, np.concatenate(made)))
+
+    def _fuse(self, keyframe: int) -> None:
+        """Points of this keyframe and of its neighbours that are the same point become one."""
+        neighbours = self._neighbours(keyframe)
+        for other in neighbours:
+            self._fuse_into(other, points_of_keyframes(self.map, np.array([keyframe], np.int32)))
+        self._fuse_into(keyframe, points_of_keyframes(self.map, np.array(neighbours, np.int32)))
+        own = self.map.points_of(keyframe)
+        self.map.refresh_points(own[own >= 0], self.orb.scale_factor, self.orb.n_levels)
+
+    def _fuse_into(self, keyframe: int, points: Ints) -> None:
+        map = self.map
+        own = map.points_of(keyframe)
+        points = points[~np.isin(points, own[own >= 0])]
+        sight = in_sight(map, points, map.pose(keyframe), self.T_body_cam, self.camera, self.orb)
+        index = FeatureIndex(map.features_of(keyframe), self.camera.width, self.camera.height)
+        radius = np.sqrt(CHI2_PX) * self.config.sigma_px * self.orb.scale(sight.octave)
+        match = index.search(
+            sight.px, radius, (sight.octave - 1, sight.octave + 1), map.points.desc[sight.point], max_hamming=50
+        )
+        first = map.feature_range(keyframe).start
+        for i in np.flatnonzero(match >= 0):
+            row, new = first + int(match[i]), int(sight.point[i])
+            old = int(map.features.point[row])
+            if old < 0:
+                map.link(np.array([row]), np.array([new]))
+            elif map.points.n_obs[old] > map.points.n_obs[new]:
+                map.fuse_points(new, old)
+            else:
+                map.fuse_points(old, new)
+
+    def _adjust(self, keyframe: int, stop: Callable[[], bool] | None) -> None:
+        """Local bundle adjustment around a keyframe; observations that do not fit are unlinked."""
+        map = self.map
+        with map.lock:
+            neighbours, _ = map.covisible(keyframe, self.config.min_shared)
+            window = np.append(neighbours[: self.config.window - 1], keyframe).astype(np.int32)
+            problem, keyframes, points, rows = bundle_of(map, window, self.orb, self.config.sigma_px)
+        result = bundle_adjust(problem, iterations=self.config.iterations, stop=stop)
+        with map.lock:
+            commit_bundle(map, result.R, result.p, result.xyz, problem.fixed, keyframes, points)
+            still = map.features.point[rows] == points[problem.point]
+            map.unlink(rows[~result.inliers & still])
+            map.refresh_points(points[map.points.alive[points]], self.orb.scale_factor, self.orb.n_levels)
+
+    def _cull_keyframes(self, keyframe: int) -> None:
+        map, kf = self.map, self.map.keyframes
+        candidates, _ = map.covisible(keyframe, self.config.min_shared)
+        candidates = candidates[np.argsort(kf.weight[candidates], kind="stable")]
+        protected = {keyframe, *map.loops.a.tolist(), *map.loops.b.tolist()}
+        for other in candidates:
+            if int(other) in protected or kf.parent[other] < 0:
+                continue
+            rows = map.feature_range(int(other))
+            share = kernels.redundant_share(
+                rows.start, rows.stop, map.features.point, map.features.next, map.features.octave,
+                map.points.head, map.points.n_obs,
+            )  # fmt: skip
+            if share > self.config.redundant:
+                map.remove_keyframe(int(other))
+
+    def _neighbours(self, keyframe: int) -> list[int]:
+        neighbours, _ = self.map.covisible(keyframe, self.config.min_shared)
+        return [int(k) for k in neighbours[: self.config.neighbours]]
+
+    def _sigma_rad(self, octave: Ints) -> Array:
+        out: Array = self.config.sigma_px / self.camera.focal_px * self.orb.scale(octave)
+        return out
+
+
+def points_at_depth(seen: Features) -> Array:
+    """(N, 3) m in the camera frame, where the features' own depths put them."""
+    out: Array = seen.ray / (seen.ray[:, 2] * seen.inv_depth)[:, None]
+    return out
+
+
+def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[BundleProblem, Ints, Ints, Ints]:
+    """The adjustment of `window` keyframes, all points they see, and (held fixed) all others that see those.
+
+    Returns the problem, the keyframe ids and point ids of its rows, and the feature row of each observation.
+    """
+    points = points_of_keyframes(map, window)
+    rows = kernels.rows_of_points(points, map.points.head, map.features.next, map.points.n_obs)
+    observer = map.features.keyframe[rows]
+    keyframes = np.unique(np.concatenate([window, observer])).astype(np.int32)
+    fixed = ~np.isin(keyframes, window) | (map.keyframes.parent[keyframes] < 0)
+    f = map.features
+    problem = BundleProblem(
+        camera=map.rig.cameras[0].camera,
+        T_body_cam=map.rig.cameras[0].T_body_cam,
+        R=map.keyframes.R[keyframes],
+        p=map.keyframes.p[keyframes],
+        fixed=fixed,
+        xyz=map.points.xyz[points],
+        keyframe=np.searchsorted(keyframes, observer).astype(np.int32),
+        point=np.searchsorted(points, f.point[rows]).astype(np.int32),
+        px=f.px[rows].astype(np.float64),
+        sigma_px=sigma_px * orb.scale(f.octave[rows]),
+        inv_depth=f.inv_depth[rows].astype(np.float64),
+        sigma_inv_depth=f.sigma_inv_depth[rows].astype(np.float64),
+        weight=map.keyframes.weight[observer],
+    )
+    return problem, keyframes, points, rows
+
+
+def commit_bundle(map: Map, R: Array, p: Array, xyz: Array, fixed: Bools, keyframes: Ints, points: AnyArray) -> None:
+    """Write adjusted poses (of keyframes that were free) and points back."""
+    free = keyframes[~fixed]
+    map.keyframes.R[free] = R[~fixed]
+    map.keyframes.p[free] = p[~fixed]
+    map.points.xyz[points] = xyz

@@ -1,0 +1,160 @@
+"""The SLAM system: features in, pose out, keyframes into the map. Read `step` first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lodelight.features.features import Features
+from lodelight.features.frontend import FrontEnd
+from lodelight.features.orb import OrbConfig
+from lodelight.geometry.se3 import SE3
+from lodelight.io.recording import Recording
+from lodelight.localization.machine import LocalizationMachine
+from lodelight.localization.relocalize import Relocalizer
+from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
+from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
+from lodelight.mapping.local import LocalMapper, LocalMappingConfig
+from lodelight.mapping.map import Map
+from lodelight.messages import Estimate, Frame, Message
+from lodelight.rig import Rig
+from lodelight.trajectory import Trajectory
+
+EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
+FOREVER_NS = 10**18
+LOST_COVARIANCE = np.diag([math.pi**2] * 3 + [1e6] * 3)
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """Every default of the system, by stage. min_start_points : close points below which no map is begun."""
+
+    sensors: str = "rgbd"
+    min_start_points: int = 50
+    orb: OrbConfig = field(default_factory=OrbConfig)
+    tracking: TrackerConfig = field(default_factory=TrackerConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    mapping: LocalMappingConfig = field(default_factory=LocalMappingConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class PathNode:
+    """A localized frame, held to the keyframe that was its reference, so that it moves as the map is corrected."""
+
+    t_ns: int
+    reference: int
+    T_reference_body: SE3
+
+
+class Slam:
+    """Simultaneous localization and mapping with RGB-D or stereo.
+
+    `run` streams a recording; `feed` takes one message at a time, for live use. `map` is the map so far; a given one
+    is continued.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        config: SlamConfig | None = None,
+        map: Map | None = None,
+        gates: tuple[Gate, ...] = (),
+        on_event: EventSink | None = None,
+    ) -> None:
+        self.config = config or SlamConfig()
+        self.map = map if map is not None else Map(rig)
+        self.gates = gates
+        self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
+        self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking)
+        self.relocalizer = Relocalizer(self.map, self.config.orb)
+        self.machine = LocalizationMachine(self.tracker, self.relocalizer.find)
+        self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
+        self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
+        self.path: list[PathNode] = []
+        self._last_keyframe_ns = -FOREVER_NS
+        self._relocalized_ns = -FOREVER_NS
+
+    def run(self, recording: Recording, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Estimate]:
+        """Estimates of all frames of a recording, as a robot would have had them at the time."""
+        for message in recording.messages(self.config.sensors, start_s, end_s):
+            estimate = self.feed(message)
+            if estimate is not None:
+                yield estimate
+
+    def feed(self, message: Message) -> Estimate | None:
+        """One message; an estimate for every frame."""
+        return self.step(message) if isinstance(message, Frame) else None
+
+    def step(self, frame: Frame) -> Estimate:
+        """One frame: see it, locate it, decide whether it becomes a keyframe, map."""
+        seen = self.front_end.process(frame)
+        if len(self.map.keyframes) == 0:
+            return self._begin(frame.t_ns, seen)
+        tracked = self.machine.locate(frame.t_ns, seen)
+        if self.machine.status == "relocalized":
+            self._relocalized_ns = frame.t_ns
+        estimate = self._estimate(tracked)
+        if estimate.localized:
+            self.path.append(PathNode(tracked.t_ns, tracked.reference, tracked.T_reference_body))
+            decision = decide(self._candidate(tracked), self.config.keyframes, self.gates)
+            self.emit(frame.t_ns, "keyframe", inserted=decision.insert, why=decision.why, weight=decision.weight)
+            if decision.insert:
+                self._insert(tracked, decision)
+        return estimate
+
+    def trajectory(self) -> Trajectory:
+        """T_world_body of all localized frames, as the map stands now."""
+        return Trajectory.from_poses(
+            [node.t_ns for node in self.path],
+            [self.map.pose(node.reference) @ node.T_reference_body for node in self.path],
+        )
+
+    # -- parts --------------------------------------------------------------------------------------------------
+
+    def _begin(self, t_ns: int, seen: Features) -> Estimate:
+        """The first keyframe of a new map, at the origin, if enough of what it sees has a depth."""
+        close = int(np.count_nonzero(self.mapper.close(seen)))
+        if close < self.config.min_start_points:
+            why = f"{close} of {len(seen)} corners have depth, {self.config.min_start_points} are needed to begin a map"
+            return Estimate(t_ns, "initializing", SE3.identity(), LOST_COVARIANCE, why)
+        nothing = np.full(len(seen), -1, np.int32)
+        first = Tracked(t_ns, seen, SE3.identity(), np.zeros((6, 6)), nothing, reference=0)
+        self._insert(first, Decision(True, "the first"))
+        self.machine.start(first)
+        self.path.append(PathNode(t_ns, 0, SE3.identity()))
+        return self._estimate(first)
+
+    def _insert(self, tracked: Tracked, decision: Decision) -> None:
+        parent = tracked.reference if len(self.map.keyframes) else -1
+        keyframe = self.mapper.insert(
+            tracked.t_ns, tracked.T_world_body, tracked.seen, tracked.point, decision.weight, parent
+        )
+        tracked.point[:] = self.map.points_of(keyframe)
+        self._last_keyframe_ns = tracked.t_ns
+        self.mapper.process(keyframe)
+
+    def _candidate(self, tracked: Tracked) -> Candidate:
+        n_keyframes = int(np.count_nonzero(self.map.keyframes.alive))
+        expected = self.map.points_of(tracked.reference)
+        expected = expected[expected >= 0]
+        min_sightings = 3 if n_keyframes > 2 else 2
+        close = self.mapper.close(tracked.seen)
+        return Candidate(
+            t_ns=tracked.t_ns,
+            inliers=tracked.n_inliers,
+            reference_points=int(np.count_nonzero(self.map.points.n_obs[expected] >= min_sightings)),
+            close_tracked=int(np.count_nonzero(close & (tracked.point >= 0))),
+            close_untracked=int(np.count_nonzero(close & (tracked.point < 0))),
+            n_keyframes=n_keyframes,
+            since_keyframe_s=(tracked.t_ns - self._last_keyframe_ns) * 1e-9,
+            since_relocalization_s=(tracked.t_ns - self._relocalized_ns) * 1e-9,
+        )
+
+    def _estimate(self, tracked: Tracked) -> Estimate:
+        covariance = LOST_COVARIANCE if tracked.why_lost else tracked.covariance
+        return Estimate(
+            tracked.t_ns, self.machine.status, tracked.T_world_body, covariance, self.machine.why, tracked.n_inliers
+        )
