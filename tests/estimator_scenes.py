@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lodelight.estimation.bundle import BundleProblem
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
-from lodelight.types import Array
+from lodelight.types import Array, Bools
 
 LENSES = {
     "radtan": Camera.create("radtan", 752, 480, (458.0, 457.0, 367.0, 248.0), (-0.28, 0.074, 2e-4, 1.8e-5)),
@@ -71,3 +72,77 @@ def random_view(
 def chart_error(estimate: SE3, truth: SE3) -> Array:
     """d (6,) with truth = estimate.perturbed(d)."""
     return np.concatenate([SE3(estimate.R.T @ truth.R, np.zeros(3)).log()[:3], truth.t - estimate.t])
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """A bundle problem and the truth behind it."""
+
+    problem: BundleProblem
+    truth: list[SE3]
+    xyz: Array
+    wrong: Bools
+
+
+def walk(
+    rng: np.random.Generator,
+    camera: Camera,
+    keyframes: int,
+    points: int,
+    per_point: float = 5.0,
+    step_m: float = 0.15,
+    noise: float = 1.0,
+    depth: float = 0.0,
+    outliers: float = 0.0,
+    fixed: int = 2,
+    sigma_rad: float = 0.01,
+    sigma_m: float = 0.02,
+) -> Walk:
+    """Keyframes along a circle that look outwards, at points 2 to 5 m before them; the start is off by the sigmas.
+
+    per_point : mean observations per point; noise multiplies the errors, not the sigmas; a mismatch lands 30 px away
+    """
+    radius = max(1.5, keyframes * step_m / (2 * np.pi))
+    turn = step_m / radius * np.arange(keyframes)
+    truth, rows = [], []
+    bearing = rng.uniform(-0.3, turn[-1] + 0.3, points)
+    reach = radius + rng.uniform(2.0, 5.0, points)
+    X = np.column_stack([reach * np.cos(bearing), reach * np.sin(bearing), rng.uniform(-0.5, 2.5, points)])
+    for k, a in enumerate(turn):
+        y, z = np.array([0.0, 0.0, -1.0]), np.array([np.cos(a), np.sin(a), 0.0])
+        T_world_cam = SE3(np.column_stack([np.cross(y, z), y, z]), radius * z + [0.0, 0.0, 1.0])
+        T_world_cam = T_world_cam.perturbed(rng.normal(size=6) * 0.03)
+        truth.append(T_world_cam @ T_BODY_CAM.inverse())
+        X_cam = T_world_cam.inverse() @ X
+        px, seen = camera.project(X_cam)
+        i = np.flatnonzero(seen & (X_cam[:, 2] > 0.5) & (np.abs(np.linalg.norm(X_cam, axis=1)) < 7.0))
+        rows.append((np.full(len(i), k), i, px[i], X_cam[i, 2]))
+    keyframe, point, px, z = (np.concatenate(column) for column in zip(*rows, strict=True))
+    kept = rng.random(len(keyframe)) < per_point * points / len(keyframe)
+    keyframe, point, px, z = keyframe[kept], point[kept], px[kept], z[kept]
+    n = len(keyframe)
+    sigma_px, sigma_inv_depth = 1.2 ** rng.integers(0, 4, n), np.full(n, 0.01)
+    px = px + noise * sigma_px[:, None] * rng.normal(size=(n, 2))
+    wrong = rng.random(n) < outliers
+    angle = rng.uniform(0, 2 * np.pi, n)
+    px[wrong] += 30.0 * np.column_stack([np.cos(angle), np.sin(angle)])[wrong]
+    inv_depth = np.maximum(1.0 / z + noise * sigma_inv_depth * rng.normal(size=n), 1e-3)
+    inv_depth[rng.random(n) >= depth] = 0.0
+    held = np.arange(keyframes) < fixed
+    off = np.array([sigma_rad] * 3 + [sigma_m] * 3)
+    start = [T if f else T.perturbed(rng.normal(size=6) * off) for T, f in zip(truth, held, strict=True)]
+    problem = BundleProblem(
+        camera=camera,
+        T_body_cam=T_BODY_CAM,
+        R=np.array([T.R for T in start]),
+        p=np.array([T.t for T in start]),
+        fixed=held,
+        xyz=X + rng.normal(size=X.shape) * sigma_m,
+        keyframe=keyframe,
+        point=point,
+        px=px,
+        sigma_px=sigma_px,
+        inv_depth=inv_depth,
+        sigma_inv_depth=sigma_inv_depth,
+    )
+    return Walk(problem, truth, X, wrong)
