@@ -94,7 +94,7 @@ def compare(
 
 
 class Places:
-    """The index of a map's keyframes: all it has when this is made, then those added. Who culls one removes it here."""
+    """The index of a map's keyframes. It follows the map by itself: every query first takes in what has changed."""
 
     def __init__(self, map: Map, vocabulary: Vocabulary | None = None) -> None:
         self.map = map
@@ -103,40 +103,32 @@ class Places:
         self._keyframe_of = np.zeros(1 << 14, np.int32)
         self._share_of = np.zeros(1 << 14, np.float32)
         self._end = 0
-        self._indexed: set[int] = set()
-        for keyframe in map.alive_keyframes:
-            self.add(int(keyframe))
+        self._indexed = np.zeros(0, np.bool_)
 
-    def __len__(self) -> int:
-        return len(self._indexed)
-
-    def __contains__(self, keyframe: int) -> bool:
-        return keyframe in self._indexed
+    def follow(self) -> None:
+        """Take in the keyframes that are new in the map, and let go of those that are gone."""
+        with self.map.lock:
+            alive = self.map.keyframes.alive
+            indexed = np.zeros(len(alive), np.bool_)
+            indexed[: len(self._indexed)] = self._indexed
+            for keyframe in np.flatnonzero(indexed & ~alive).tolist():
+                words, _ = self.describe(self._desc(keyframe))
+                erase(keyframe, words, self._lists, self._keyframe_of, self._share_of)
+            for keyframe in np.flatnonzero(alive & ~indexed).tolist():
+                words, shares = self.describe(self._desc(keyframe))
+                self._make_room(words)
+                insert(keyframe, words, shares, self._lists, self._keyframe_of, self._share_of)
+            self._indexed = alive.copy()
 
     def describe(self, desc: Words) -> tuple[Ints, ArrayF32]:
         """The distinct words of descriptors (N, 4), and their shares."""
         return bag_of_words(self.vocabulary.words(desc), self.vocabulary.idf)
 
-    def add(self, keyframe: int) -> None:
-        """Index a keyframe of the map by its descriptors."""
-        if keyframe in self._indexed:
-            return
-        words, shares = self.describe(self._desc(keyframe))
-        self._make_room(words)
-        insert(keyframe, words, shares, self._lists, self._keyframe_of, self._share_of)
-        self._indexed.add(keyframe)
-
-    def remove(self, keyframe: int) -> None:
-        """Forget a keyframe; one that is not in the index is no error."""
-        if keyframe in self._indexed:
-            words, _ = self.describe(self._desc(keyframe))
-            erase(keyframe, words, self._lists, self._keyframe_of, self._share_of)
-            self._indexed.discard(keyframe)
-
     def similarity(self, desc: Words) -> tuple[ArrayF32, Ints]:
         """Similarity in [0, 1] of descriptors (N, 4) to every keyframe of the map, and their distinct common words."""
+        self.follow()
         words, shares = self.describe(desc)
-        return compare(words, shares, self._lists, self._keyframe_of, self._share_of, len(self.map.keyframes))
+        return compare(words, shares, self._lists, self._keyframe_of, self._share_of, len(self._indexed))
 
     def candidates(self, desc: Words, excluded: AnyArray | None = None, min_score: float = 0.0, limit: int = 5) -> Ints:
         """Keyframes that look most like descriptors (N, 4), the best of each place, best place first.
