@@ -25,18 +25,25 @@ def room_points(count: int, rng: np.random.Generator) -> np.ndarray:
     return xyz
 
 
+def walk(frames: int) -> Trajectory:
+    """The true path: rounds of the room at 30 Hz."""
+    t_s = np.arange(frames) / 30
+    turn = 2 * np.pi * t_s / max(t_s[-1], 1) * max(1, round(frames / 900))
+    xyz = np.stack([2.8 * np.cos(turn), 1.9 * np.sin(turn), 1.4 + 0.05 * np.sin(9 * turn)], axis=1)
+    tilt = np.stack([0.05 * np.sin(3 * turn), 0.05 * np.cos(2 * turn), turn], axis=1)
+    t_ns = START_NS + np.round(t_s * 1e9).astype(np.int64)
+    poses = [SE3.exp(np.concatenate(pair)) for pair in zip(tilt, xyz, strict=True)]
+    return Trajectory.from_poses(t_ns.tolist(), poses)
+
+
 def make_run(
     out: Path, frames: int = 300, points: int = 2000, truth: bool = True, seed: int = 0, slow_ms: float = 1.0
 ) -> dict[str, Any]:
     """Write an out folder of a 30 Hz run and return its metrics; slow_ms scales the made-up timings."""
     rng = np.random.default_rng(seed)
-    t_s = np.arange(frames) / 30
-    turn = 2 * np.pi * t_s / max(t_s[-1], 1) * max(1, round(frames / 900))
-    xyz = np.stack([2.8 * np.cos(turn), 1.9 * np.sin(turn), 1.4 + 0.05 * np.sin(9 * turn)], axis=1)
-    t_ns = START_NS + np.round(t_s * 1e9).astype(np.int64)
-    true = [
-        SE3.exp(np.array([0.05 * np.sin(3 * a), 0.05 * np.cos(2 * a), a, *p])) for a, p in zip(turn, xyz, strict=True)
-    ]
+    true = walk(frames)
+    t_ns = true.t_ns.tolist()
+    recording_s = (t_ns[-1] - t_ns[0]) / 1e9
     drift = np.cumsum(rng.normal(0, 0.004, (frames, 6)), axis=0) * np.sin(np.linspace(0, np.pi, frames))[:, None]
     world = SE3.exp(np.array([0.1, -0.2, 0.7, 1.0, 2.0, 0.3]))
     lost = slice(frames // 2, frames // 2 + max(frames // 20, 1))
@@ -46,31 +53,29 @@ def make_run(
         for i in range(frames):
             status = "initializing" if i == 0 else "lost" if lost.start <= i < lost.stop else "tracking"
             status = "relocalized" if i == lost.stop else "degraded" if lost.start - 8 <= i < lost.start else status
-            pose = world @ true[i].perturbed(0.3 * drift[i])
+            pose = world @ true.pose(i).perturbed(0.3 * drift[i])
             sigma = 0.002 + 0.00002 * i
             covariance = np.diag([*[(0.3 * sigma) ** 2] * 3, *[sigma**2] * 3])
             why = f"{rng.integers(3, 12)} of 120 tracks survived" if status == "lost" else ""
             keyframe = i % 12 == 0 and status == "tracking"
             outputs.frame(
-                Estimate(
-                    int(t_ns[i]), status, pose, covariance, why, int(rng.normal(220, 25)) if status != "lost" else 5
-                ),
+                Estimate(t_ns[i], status, pose, covariance, why, int(rng.normal(220, 25)) if status != "lost" else 5),
                 track_ms=slow_ms * (14 + rng.gamma(2, 2.0)),
                 map_ms=slow_ms * (30 + rng.gamma(3, 8.0)) if keyframe else 0.0,
             )
             if status == "tracking":
                 reason = "0.71 of the reference keyframe's points seen" if keyframe else "enough overlap"
-                outputs.event(int(t_ns[i]), "keyframe", insert=keyframe, reason=reason, weight=np.float64(0.9))
+                outputs.event(t_ns[i], "keyframe", inserted=keyframe, why=reason, weight=np.float64(0.9))
             if status == "relocalized":
-                outputs.event(int(t_ns[i]), "relocalization", candidates=np.int64(4), inliers=87, keyframe=3)
+                outputs.event(t_ns[i], "relocalization", candidates=np.int64(4), inliers=87, keyframe=3)
             if status != "lost":
-                final.append((int(t_ns[i]), world @ true[i].perturbed(0.1 * drift[i])))
+                final.append((t_ns[i], world @ true.pose(i).perturbed(0.1 * drift[i])))
         return outputs.finish(
             Trajectory.from_poses([t for t, _ in final], [T for _, T in final]),
             world @ room_points(points, rng),
             {"keyframes": frames // 12, "map_points": points, "loops": 1, "relocalizations": 1},
-            Trajectory.from_poses(t_ns.tolist(), true) if truth else None,
-            wall_s=0.62 * t_s[-1] + 4.2,
+            true if truth else None,
+            wall_s=0.62 * recording_s + 4.2,
             compile_s=4.2,
-            recording_s=float(t_s[-1]),
+            recording_s=recording_s,
         )

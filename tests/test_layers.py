@@ -17,7 +17,7 @@ LAYERS = [
     ["report"],
     ["sim", "evaluation"],
     ["io"],
-    ["rig", "anchors", "trajectory"],
+    ["rig", "anchors", "trajectory", "settings"],
     ["messages"],
     ["geometry"],
     ["compiled", "types", "errors", "data"],

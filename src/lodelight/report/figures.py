@@ -43,6 +43,15 @@ def thinned(count: int, worst: Array | None = None) -> AnyArray:
     return np.array([a + int(np.argmax(worst[a:b])) for a, b in zip(edges, ends, strict=True)])
 
 
+def broken(t_ns: AnyArray, rows: AnyArray, *columns: AnyArray) -> list[Array]:
+    """The drawn rows of some columns (N, ...), with NaN between rows where the stamps (N,) have a hole."""
+    steps = np.diff(t_ns)
+    usual = np.median(steps) if len(steps) else 0
+    holes = np.flatnonzero(steps > 5 * usual) + 1
+    after = np.unique(np.searchsorted(rows, holes))
+    return [np.insert(np.asarray(column, dtype=float)[rows], after, np.nan, axis=0) for column in columns]
+
+
 def line(x: AnyArray, y: AnyArray, name: str, colour: str, **style: Any) -> Figure:
     trace = {"type": "scatter", "mode": "lines", "name": name, "x": packed(x), "y": packed(y)}
     return trace | {"line": {"color": colour, "width": 1.5, **style.pop("line", {})}} | style
@@ -87,12 +96,12 @@ def timing(run: RunFolder) -> Figure:
         marks = {"mode": "markers", "marker": {"color": LIVE, "size": 4, "opacity": 0.7}}
         traces.append(line(run.seconds(t_ns[mapped]), mapping[mapped], "mapping (keyframes)", LIVE, **marks))
     shapes, notes = [], []
-    for name in ("p50", "p95", "p99"):
+    for name, anchor in (("p50", "top"), ("p95", "middle"), ("p99", "bottom")):
         y = run.metrics["ms_per_frame"][name]
         if y is not None:
             across = {"xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y}
             shapes.append({"type": "line", **across, "line": {"color": TRUTH, "width": 1, "dash": "dot"}})
-            place = {"xref": "paper", "x": 1, "xanchor": "left", "y": y, "yanchor": "middle", "showarrow": False}
+            place = {"xref": "paper", "x": 1, "xanchor": "left", "y": y, "yanchor": anchor, "showarrow": False}
             notes.append({"text": f" {name}", "font": {"color": TRUTH, "size": 11}, **place})
     return over_time(traces, "ms", shapes=shapes, annotations=notes, margin={"r": 36})
 
@@ -105,28 +114,36 @@ def inliers(run: RunFolder) -> Figure:
 
 
 def sigma(run: RunFolder) -> Figure:
-    t_s = run.seconds(run.sigma_t_ns)
-    rows = thinned(len(t_s), run.sigma_m)
-    cm, deg = 100 * run.sigma_m[rows], run.sigma_deg[rows]
-    traces = [
-        line(t_s[rows], cm, "position (cm)", FINAL),
-        line(t_s[rows], deg, "rotation (deg)", LIVE),
-    ]
+    t_ns = run.sigma_t_ns
+    rows = thinned(len(t_ns), run.sigma_m)
+    t_s, metres, degrees = broken(t_ns, rows, run.seconds(t_ns), run.sigma_m, run.sigma_deg)
+    traces = [line(t_s, 100 * metres, "position, cm", FINAL), line(t_s, degrees, "rotation, deg", LIVE)]
+    if run.live.errors:
+        e = run.live.errors
+        t_s, metres = broken(e.t_ns, thinned(len(e.t_ns), e.position_m), run.seconds(e.t_ns), e.position_m)
+        traces.insert(0, line(t_s, 100 * metres, "true position error, cm", TRUTH, line={"width": 1}))
     return over_time(traces, "1 sigma", yaxis={"type": "log", "rangemode": "normal"})
 
 
 def errors_over(run: RunFolder, abscissa: str) -> Figure:
-    """Position error in cm and rotation error in degrees, over time or over the distance travelled."""
+    """Position error in cm, left, and rotation error in degrees, right, over time or over the distance travelled."""
     traces = []
     for path, name, colour in ((run.live, "live", LIVE), (run.final, "final", FINAL)):
         e = path.errors
         if e is None:
             continue
-        rows = thinned(len(e.t_ns), e.position_m)
-        x = run.seconds(e.t_ns[rows]) if abscissa == "time" else e.along_m[rows]
-        traces.append(line(x, 100 * e.position_m[rows], f"{name}, cm", colour))
-        traces.append(line(x, e.rotation_deg[rows], f"{name}, deg", colour, line={"width": 1, "dash": "dot"}))
-    figure = over_time(traces, "error (cm, deg)")
+        x = run.seconds(e.t_ns) if abscissa == "time" else e.along_m
+        x, metres, degrees = broken(e.t_ns, thinned(len(e.t_ns), e.position_m), x, e.position_m, e.rotation_deg)
+        traces.append(line(x, 100 * metres, f"{name}, cm", colour))
+        traces.append(line(x, degrees, f"{name}, deg", colour, yaxis="y2", line={"width": 1, "dash": "dot"}))
+    right = {
+        "title": {"text": "rotation (deg)"},
+        "overlaying": "y",
+        "side": "right",
+        "tickmode": "auto",
+        "rangemode": "tozero",
+    }
+    figure = over_time(traces, "position (cm)", yaxis2={**right, "showgrid": False})
     if abscissa != "time":
         figure["time"] = False
         figure["layout"]["xaxis"]["title"]["text"] = "distance travelled (m)"
@@ -141,10 +158,10 @@ def plane(run: RunFolder, axes: str) -> Figure:
         xyz = _during(run.truth.xyz, run.truth.t_ns, run)
         traces.append(line(xyz[:, i], xyz[:, j], "truth", TRUTH, line={"dash": "dash"}))
     for path, name, colour, width in ((run.live, "live", LIVE, 1), (run.final, "final", FINAL, 2)):
-        xyz = path.poses.xyz[thinned(len(path.poses))]
+        (xyz,) = broken(path.poses.t_ns, thinned(len(path.poses)), path.poses.xyz)
         traces.append(line(xyz[:, i], xyz[:, j], name, colour, line={"width": width}))
     xyz = keyframes(run)
-    marks = {"mode": "markers", "marker": {"color": FINAL, "size": 5, "symbol": "square-open"}}
+    marks = {"mode": "markers", "marker": {"color": FINAL, "size": 4, "symbol": "square-open"}}
     traces.append(line(xyz[:, i], xyz[:, j], "keyframes", FINAL, **marks))
     x_axis = {"title": {"text": f"{axes[0]} (m)"}}
     y_axis = {"title": {"text": f"{axes[1]} (m)"}, "scaleanchor": "x", "scaleratio": 1}
@@ -159,8 +176,9 @@ def space(run: RunFolder) -> Figure:
     if run.final.alignment is not None and len(xyz):
         a = run.final.alignment
         xyz = a.scale * xyz @ a.R.T + a.t
-    path = run.final.poses.xyz[thinned(len(run.final.poses))]
-    low, high = _box(xyz, path)
+    poses = run.final.poses
+    (path,) = broken(poses.t_ns, thinned(len(poses)), poses.xyz)
+    low, high = _box(xyz, poses.xyz)
     xyz = xyz[((xyz >= low) & (xyz <= high)).all(axis=1)]
     marker = {"size": 1.4, "color": packed(xyz[:, 2]), "colorscale": "Viridis", "opacity": 0.8}
     traces = [
@@ -169,12 +187,13 @@ def space(run: RunFolder) -> Figure:
         {"name": "keyframes", "mode": "markers", "marker": {"size": 2.5, "color": LIVE}, **_xyz(keyframes(run))},
     ]
     ranges = {f"{axis}axis": {"range": [float(low[k]), float(high[k])]} for k, axis in enumerate("xyz")}
-    return {"data": traces, "layout": {"scene": {"aspectmode": "data", **ranges}, "height": 560}}
+    camera = {"eye": {"x": -0.9, "y": -1.2, "z": 0.85}, "center": {"x": 0, "y": 0, "z": -0.1}}
+    return {"data": traces, "layout": {"scene": {"aspectmode": "data", "camera": camera, **ranges}}}
 
 
 def keyframes(run: RunFolder) -> Array:
     """Where the final path was at the keyframes' stamps, (K, 3) m."""
-    stamps = [e["t_ns"] for e in run.events if e.get("kind") == "keyframe" and e.get("insert")]
+    stamps = [e["t_ns"] for e in run.events if e.get("kind") == "keyframe" and e.get("inserted")]
     rows = np.flatnonzero(np.isin(run.final.poses.t_ns, np.array(stamps, dtype=np.int64)))
     return run.final.poses.xyz[rows[thinned(len(rows))]]
 

@@ -104,10 +104,10 @@ def _cards(m: dict[str, Any]) -> list[str]:
     ms = m["ms_per_frame"]
     if ms["p50"] is not None:
         more = f"mean {ms['mean']:.1f} · p95 {ms['p95']:.1f} · p99 {ms['p99']:.1f}"
-        cards.append(_card("Median time per frame", f"{ms['p50']:.1f} ms", more))
+        cards.append(_card("Per frame, median", f"{ms['p50']:.1f} ms", more))
     if m["real_time_factor"] is not None:
         cards.append(_card("Real-time factor", f"{m['real_time_factor']:.2f}", "mapping counted in; below 1 keeps up"))
-    more = f"{m['keyframes']:,} keyframes · {m['loops']} loops · {m['relocalizations']} relocalizations"
+    more = f"keyframes {m['keyframes']:,} · loops {m['loops']} · relocalizations {m['relocalizations']}"
     cards.append(_card("Map points", f"{m['map_points']:,}", more))
     if any(m["gate"].values()):
         more = f"{m['gate']['veto']} vetoed · {m['gate']['abstain']} unverified"
@@ -131,7 +131,7 @@ def _events(run: RunFolder) -> tuple[list[dict[str, Any]], str]:
     """Rows of the table, of each kind at most MAX_EVENTS_OF_A_KIND evenly spread, and a line that says so."""
     by_kind: dict[str, list[int]] = {}
     for i, event in enumerate(run.events):
-        none = " (none)" if event.get("insert") is False else ""
+        none = " (none)" if event.get("inserted") is False else ""
         by_kind.setdefault(f"{event['kind']}{none}", []).append(i)
     rows, cut = [], []
     for kind, indices in by_kind.items():
@@ -141,7 +141,9 @@ def _events(run: RunFolder) -> tuple[list[dict[str, Any]], str]:
         for i in indices:
             event = run.events[i]
             what = ", ".join(
-                f"{k} {_word(v)}" for k, v in event.items() if k not in ("t_ns", "kind") and v not in ("", None)
+                f"{k} {_word(v)}"
+                for k, v in event.items()
+                if k not in ("t_ns", "kind", "inserted") and v not in ("", None)
             )
             t_s = float(run.seconds(np.array(event["t_ns"], dtype=np.int64)))
             rows.append((i, {"t_s": round(t_s, 3), "kind": kind, "what": what}))

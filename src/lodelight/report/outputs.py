@@ -56,7 +56,7 @@ class Outputs:
             raise SourceError(f"cannot write {self.out}: {error.strerror}; choose another --out") from None
         write_text(self.out / "config.toml", tomli_w.dumps(_without_none(plain(config)) | {"versions": versions()}))
 
-    def event(self, t_ns: int, kind: str, **fields: Any) -> None:
+    def event(self, t_ns: int | None, kind: str, **fields: Any) -> None:
         """One line of `events.jsonl`, on disk when this returns; from any thread."""
         line = json_line({"t_ns": t_ns, "kind": kind, **fields})
         try:

@@ -17,16 +17,18 @@ function dressed(layout) {
     ...layout,
     xaxis: { ...axis, ...(layout.xaxis || {}) },
     yaxis: { ...axis, ...(layout.yaxis || {}) },
+    ...(layout.yaxis2 ? { yaxis2: { ...axis, ...layout.yaxis2 } } : {}),
     scene: { ...own, ...scene },
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: ink },
     margin: { l: 56, r: 16, t: 8, b: 44, ...(layout.margin || {}) },
     legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom", bgcolor: "rgba(0,0,0,0)" },
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: rule, activecolor: ink },
     showlegend: true, hovermode: "closest",
   };
 }
 
-const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d"] };
+const config = { responsive: true, displaylogo: false, modeBarButtons: [["toImage"]] };
 const timed = [];
 let following = false;
 for (const [id, figure] of Object.entries(data.figures)) {
