@@ -9,6 +9,11 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import settings
+
+# The first example of many a test compiles a kernel; none may fail for taking its time.
+settings.register_profile("lodelight", deadline=None)
+settings.load_profile("lodelight")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -16,6 +16,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -77,12 +78,14 @@ def append_image(sensor: Path, t_ns: int, image: AnyArray) -> None:
     if not ok:
         raise SourceError(f"cannot encode image {t_ns} of {sensor}: {image.dtype} {image.shape} is no PNG")
     target = sensor / "data" / name
+    half = target.with_suffix(".part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        half = target.with_suffix(".part")
         half.write_bytes(data.tobytes())
         os.replace(half, target)
     except OSError as error:
+        with suppress(OSError):
+            half.unlink(missing_ok=True)
         raise SourceError(f"cannot write {target}: {error.strerror}; make room or choose another --out") from None
     _append(sensor, [f"{t_ns},{name}\n"])
 

@@ -41,21 +41,21 @@ def seconds_text(t_ns: int) -> str:
 def increasing(t_ns: NDArray[np.int64]) -> Bools:
     """Which of (N,) stamps to keep so that the kept ones strictly increase and the fewest are lost.
 
-    The longest increasing subsequence: one stamp that jumps ahead costs itself, not all that follow it.
+    The longest increasing subsequence, of several the one that takes the earlier stamps: one that jumps ahead costs
+    itself, not all that follow it, and of two alike the first stays.
     """
-    tails: list[int] = []
-    ends: list[int] = []
-    before = np.full(len(t_ns), -1, dtype=np.int64)
-    for i, t in enumerate(t_ns.tolist()):
-        at = bisect_left(tails, t)
-        before[i] = ends[at - 1] if at else -1
-        tails[at : at + 1] = [t]
-        ends[at : at + 1] = [i]
-    keep = np.zeros(len(t_ns), dtype=np.bool_)
-    i = ends[-1] if ends else -1
-    while i >= 0:
-        keep[i] = True
-        i = int(before[i])
+    stamps = t_ns.tolist()
+    ahead: list[int] = []  # for each length, minus the largest stamp that begins an increasing run of it
+    lengths = [0] * len(stamps)
+    for i in range(len(stamps) - 1, -1, -1):
+        at = bisect_left(ahead, -stamps[i])
+        ahead[at : at + 1] = [-stamps[i]]
+        lengths[i] = at + 1
+    keep = np.zeros(len(stamps), dtype=np.bool_)
+    wanted, last = len(ahead), -1
+    for i, t in enumerate(stamps):
+        if lengths[i] == wanted and (last < 0 or t > stamps[last]):
+            keep[i], last, wanted = True, i, wanted - 1
     return keep
 
 
