@@ -22,6 +22,7 @@ from lodelight.errors import LodelightError, RunError
 COMMANDS = {
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),
     "eval": ("lodelight.cli.evaluate", "Compare a trajectory with the truth: ATE, RPE, coverage, NEES."),
+    "map": ("lodelight.cli.map", "Inspect, check and export saved maps."),
 }
 
 # Typer keeps a copy of click of its own since 0.16; by this name the class is the right one in both.

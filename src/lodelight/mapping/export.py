@@ -7,18 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from lodelight.geometry.se3 import SE3
 from lodelight.io.clouds import write_pcd, write_ply
 from lodelight.io.colmap import Sightings, write_colmap
+from lodelight.io.occupancy import FREE, OCCUPIED, write_occupancy
+from lodelight.mapping.grid import occupancy_grid
 from lodelight.mapping.map import Map
+from lodelight.mapping.upright import estimate_up
+from lodelight.types import Array
+
+LEVEL_DEG = 3.0  # nearer to the map's own z than an estimate of up errs, z it is
 
 
-def export_cloud(map: Map, out: Path) -> dict[str, Any]:
-    """The living points with their mean viewing direction and number of observations, `.ply` or `.pcd` by name."""
+def export_cloud(map: Map, out: Path, format: str) -> dict[str, Any]:
+    """The living points with their mean viewing direction and number of observations; format ply or pcd."""
     p = map.points
-    alive = p.alive
-    write = write_pcd if out.suffix.lower() == ".pcd" else write_ply
-    write(out, p.xyz[alive], p.normal[alive], n_obs=p.n_obs[alive])
-    return {"points": int(alive.sum())}
+    write = {"ply": write_ply, "pcd": write_pcd}[format]
+    write(out, p.xyz[p.alive], p.normal[p.alive], n_obs=p.n_obs[p.alive])
+    return {"points": int(p.alive.sum())}
 
 
 def export_colmap(map: Map, folder: Path) -> dict[str, Any]:
@@ -31,3 +37,46 @@ def export_colmap(map: Map, folder: Path) -> dict[str, Any]:
     images = [(f"{map.keyframes.t_ns[k]}.png", map.pose(int(k)) @ spec.T_body_cam) for k in keyframes]
     write_colmap(folder, spec.camera, images, map.points.xyz[points], seen)
     return {"images": len(images), "points": len(points), "observations": len(seen)}
+
+
+def export_grid(map: Map, out: Path, up: Array | None = None, **options: Any) -> dict[str, Any]:
+    """The occupancy grid of all sightings, PGM and YAML, with its frame told in comments.
+
+    up : unit (3,) in the map's frame, estimated where it is None; options as of `occupancy_grid`
+    """
+    how = "as given"
+    if up is None:
+        up, how = map_up(map)
+    k, f = map.keyframes, map.features
+    rows = np.flatnonzero(f.point >= 0)
+    centres = k.p + k.R @ map.rig.cameras[0].T_body_cam.t
+    grid = occupancy_grid(centres[f.keyframe[rows]], map.points.xyz[f.point[rows]], up, **options)
+    told = {
+        "up": f"{' '.join(f'{v + 0.0:.4f}' for v in up)} in the map's frame, {how}",
+        "floor_m": round(grid.floor_m, 3),
+        "quat_xyzw_grid_map": np.round(SE3(grid.R_grid_map, np.zeros(3)).quat_xyzw + 0.0, 9).tolist(),
+        "cells": list(grid.cells.shape[::-1]),
+        "occupied": int((grid.cells == OCCUPIED).sum()),
+        "free": int((grid.cells == FREE).sum()),
+    }
+    remarks = "\n".join(f"{key}: {told[key]}" for key in ("up", "floor_m", "quat_xyzw_grid_map"))
+    write_occupancy(out, grid.cells, grid.resolution_m, grid.origin_xy_m, remarks)
+    return told
+
+
+def map_up(map: Map) -> tuple[Array, str]:
+    """Unit vector up (3,) in the map's frame, and how it is known."""
+    z = np.array([0.0, 0.0, 1.0])
+    keyframes, spec = map.alive_keyframes, map.rig.cameras[0]
+    if map.rig.imu is not None:
+        return z, "the map's z, levelled by the IMU"
+    if not len(keyframes):
+        return z, "the map's z, for want of keyframes"
+    poses = [map.pose(int(k)) @ spec.T_body_cam for k in keyframes]
+    R_world_cam, centres = np.array([T.R for T in poses]), np.array([T.t for T in poses])
+    up, share = estimate_up(map.points.xyz[map.points.alive], R_world_cam, centres)
+    if share == 0.0:
+        return up, "the cameras' own on the average, for want of a floor or a table; better give it"
+    if up @ z > np.cos(np.radians(LEVEL_DEG)):
+        return z, f"the map's z, within {LEVEL_DEG:g} degrees of the normal of the largest surface seen from above"
+    return up, f"the normal of the largest surface seen from above, which holds {100 * share:.0f} % of the points"
