@@ -214,6 +214,17 @@ def test_a_list_of_times_stamps_an_image_folder(tmp_path, rows):
     ]
 
 
+def test_deep_and_coloured_images_become_grey_bytes(tmp_path):
+    """TUM-VI stores 16 bit; a Kinect's colour is weighed as OpenCV weighs it."""
+    rng = np.random.default_rng(0)
+    colour = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    write(tmp_path / "0.png", picture(3).astype(np.uint16) * 257)
+    write(tmp_path / "1.png", colour)
+    deep, grey = (f.images[0] for f in frames(open_source(tmp_path, tiny_rig()), "mono"))
+    assert np.array_equal(deep, picture(3))
+    assert np.abs(grey.astype(int) - cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)).max() <= 1  # rounding
+
+
 def test_a_rig_file_in_the_folder_speaks_for_it(tmp_path):
     for i in range(3):
         write(tmp_path / f"{i}.png", picture(i))
