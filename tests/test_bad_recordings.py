@@ -171,8 +171,15 @@ def test_a_missing_or_broken_depth_image_skips_its_frame(tmp_path):
 
 
 def test_depth_that_is_zero_throughout_is_an_error_before_the_first_frame(tmp_path):
-    with pytest.raises(SourceError, match="all 6 depth images are zero"):
+    with pytest.raises(SourceError, match="every depth image is zero"):
         next(iter(open_source(write_tum(tmp_path, depth_m=0.0)).messages("rgbd")))
+
+
+def test_a_recording_that_begins_without_depth_readings_is_read(tmp_path):
+    write_tum(tmp_path, n=12)
+    for i in (0, 2, 5, 8, 11):  # all that are looked at first
+        write(tmp_path / f"depth/{seconds(START_NS + i * PERIOD_NS + 3_000_000)}.png", np.zeros((480, 640), np.uint16))
+    assert len(numbers(open_source(tmp_path), "rgbd")) == 12
 
 
 def test_one_frame_without_depth_readings_is_passed_on_with_none(tmp_path):

@@ -23,19 +23,18 @@ class DepthReader:
         metres = raw / spec.units_per_m
         self._table = np.where((metres >= spec.min_m) & (metres <= spec.max_m), metres, 0.0).astype(np.float32)
         self._table[0] = 0.0
-        own_view = spec.registered or (spec.camera is cam0.camera and spec.T_body_depth is cam0.T_body_cam)
         T_cam_depth = cam0.T_body_cam.inverse() @ spec.T_body_depth
-        self._registration = None if own_view else Registration(spec.camera, cam0.camera, T_cam_depth)
+        self._registration = None if spec.registered else Registration(spec.camera, cam0.camera, T_cam_depth)
 
     def metres(self, raw: NDArray[np.uint16]) -> ArrayF32:
         """(H, W) stored values to (H', W') m of camera 0, 0 = no reading."""
         depth_m = np.take(self._table, raw)
         return self._registration(depth_m) if self._registration else depth_m
 
-    def median_m(self, raw: NDArray[np.uint16]) -> float | None:
-        """Median of all readings before the range is applied; None where there is no reading."""
+    def median_m(self, raw: NDArray[np.uint16]) -> float:
+        """Median of all readings before the range is applied; 0 where there is no reading."""
         readings = raw[(raw > 0) & (raw < 65535)]
-        return float(np.median(readings)) / self.spec.units_per_m if len(readings) else None
+        return float(np.median(readings)) / self.spec.units_per_m if len(readings) else 0.0
 
     def check_unit(self, median_m: float, where: str) -> None:
         """Raises SourceError where half the readings lie nearer, or farther, than any room allows."""

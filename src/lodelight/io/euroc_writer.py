@@ -188,7 +188,7 @@ def _value(value: object) -> str:
         return "true" if value else "false"
     if isinstance(value, list):
         return "[" + ", ".join(map(_value, value)) + "]"
-    return value if isinstance(value, str) else _number(value)
+    return _number(value) if isinstance(value, int | float) else str(value)
 
 
 def _text(text: str) -> str:
@@ -196,9 +196,9 @@ def _text(text: str) -> str:
     return text if re.fullmatch(r"[A-Za-z][\w ,.()/-]*", text) else json.dumps(text)
 
 
-def _number(value: object) -> str:
+def _number(value: float) -> str:
     """Exact digits, in a form every YAML reader takes for a number (`1e-05` is a text to some)."""
-    text = repr(value if isinstance(value, int) else float(str(value)))
+    text = str(value)
     mantissa, e, exponent = text.partition("e")
     return text if not e else f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
 

@@ -149,21 +149,24 @@ class ListedRecording(Recording):
         Looks at five frames spread over the recording, and at the others only where these are empty.
         """
         assert self._depth_reader is not None
-        assert self._listing.depth is not None
-        n = self.n_frames
-        probes = dict.fromkeys([*np.linspace(0, n - 1, min(n, 5)).astype(int).tolist(), *range(n)])
-        readable = 0
-        for i in probes:
-            try:
-                median_m = self._depth_reader.median_m(self._raw_depth(i))
-            except BadFrame:
-                continue
-            readable += 1
-            if median_m is not None:
-                self._depth_reader.check_unit(median_m, str(self._listing.depth[i]))
-                return
-        if readable:
-            raise SourceError(f"{self.path}: all {readable} depth images are zero; check the depth sensor")
+        spread = sorted(set(np.linspace(0, self.n_frames - 1, 5).astype(int).tolist()))
+        medians = [m for i in spread if (m := self._median_depth_m(i)) is not None]
+        if not any(medians):
+            others = (self._median_depth_m(i) for i in range(self.n_frames) if i not in spread)
+            found = next((m for m in others if m), None)
+            if found is None and medians:
+                raise SourceError(f"{self.path}: every depth image is zero throughout; check the depth sensor")
+            medians = [found] if found else []
+        if readings := [m for m in medians if m > 0]:
+            self._depth_reader.check_unit(float(np.median(readings)), str(self.path))
+
+    def _median_depth_m(self, i: int) -> float | None:
+        """Of a frame's readings; 0 where it has none, None where its depth cannot be read."""
+        assert self._depth_reader is not None
+        try:
+            return self._depth_reader.median_m(self._raw_depth(i))
+        except BadFrame:
+            return None
 
 
 def _with_rate(spec: CameraSpec, t_ns: NDArray[np.int64]) -> CameraSpec:

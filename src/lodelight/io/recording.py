@@ -103,7 +103,7 @@ class Recording(ABC):
             raise ConfigError(f"sensors {sensors!r} are unknown; choose one of {', '.join(CAMERAS)} (-inertial)")
         rig = self.rig
         if CAMERAS[base] > len(rig.cameras) or (base == "rgbd" and not rig.depth) or (suffix and not rig.imu):
-            raise SourceError(f"{self.path} cannot serve {sensors}; the most it can is {rig.sensors}")
+            raise SourceError(f"{self.path} with its rig cannot serve {sensors}; the most it can is {rig.sensors}")
         frames = self.frames(CAMERAS[base], base == "rgbd", start_s, end_s)
         return self._woven(frames, self.inertial(start_s, end_s)) if suffix else frames
 

@@ -57,7 +57,7 @@ def open_tum_rgbd(path: Path, rig: Rig | None) -> ListedRecording:
 
 def _built_in_rig(path: Path) -> Rig:
     text = path.resolve().name + "".join(read_text(path / name)[:500] for name in _comment_files(path))
-    found = re.search(r"(?:freiburg|fr)_?([123])(?!\d)", text)
+    found = re.search(r"(?<![a-z])(?:freiburg|fr)_?([123])(?!\d)", text)
     if not found:
         raise CalibrationError(
             f"{path} does not say which freiburg camera took it; put a rig.toml there or give --rig FILE"
