@@ -126,10 +126,11 @@ def test_candidates_are_the_alike_but_never_the_excluded(vocabulary):
     images = images_of(rng, vocabulary, 40)
     places = Places(map_of(images), vocabulary)
     again = flipped(rng, images[11], 0.02)
-    assert places.candidates(again).tolist() == [11]
-    assert 11 not in places.candidates(again, excluded=np.array([11]))
-    assert len(places.candidates(again, excluded=np.arange(40))) == 0
-    assert len(places.candidates(again, min_score=1.01)) == 0
+    assert places.candidates(again, limit=3).tolist() == [11]
+    found = places.similarity(again)
+    assert 11 not in places.best(*found, limit=3, excluded=np.array([11]))
+    assert len(places.best(*found, limit=3, excluded=np.arange(40))) == 0
+    assert len(places.best(*found, limit=3, min_score=1.01)) == 0
 
 
 def test_of_a_neighbourhood_that_looks_alike_only_the_best_is_a_candidate(vocabulary):
@@ -140,11 +141,11 @@ def test_of_a_neighbourhood_that_looks_alike_only_the_best_is_a_candidate(vocabu
     points = map.add_points(np.zeros((50, 3)), np.arange(50) + map.keyframes.first_feature[4], 4)
     for keyframe in (20, 21, 22):
         map.link(np.arange(50) + map.keyframes.first_feature[keyframe], points)
-    assert Places(map, vocabulary).candidates(images[4]).tolist() == [4]
+    assert Places(map, vocabulary).candidates(images[4], limit=3).tolist() == [4]
 
 
 def test_an_empty_index_and_an_empty_image_have_no_candidates(vocabulary):
     rng = np.random.default_rng(9)
     images = images_of(rng, vocabulary, 5)
-    assert len(Places(map_of([]), vocabulary).candidates(images[0])) == 0
-    assert len(Places(map_of(images), vocabulary).candidates(np.zeros((0, 4), np.uint64))) == 0
+    assert len(Places(map_of([]), vocabulary).candidates(images[0], limit=3)) == 0
+    assert len(Places(map_of(images), vocabulary).candidates(np.zeros((0, 4), np.uint64), limit=3)) == 0

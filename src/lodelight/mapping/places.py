@@ -130,19 +130,24 @@ class Places:
         words, shares = self.describe(desc)
         return compare(words, shares, self._lists, self._keyframe_of, self._share_of, len(self._indexed))
 
-    def candidates(self, desc: Words, excluded: AnyArray | None = None, min_score: float = 0.0, limit: int = 5) -> Ints:
-        """Keyframes that look most like descriptors (N, 4), the best of each place, best place first.
+    def candidates(self, desc: Words, limit: int) -> Ints:
+        """Keyframes that look most like descriptors (N, 4), one of each place, the best place first."""
+        return self.best(*self.similarity(desc), limit=limit)
+
+    def best(
+        self, score: ArrayF32, common: Ints, limit: int, excluded: AnyArray | None = None, min_score: float = 0.0
+    ) -> Ints:
+        """Keyframes with the best `similarity`, one of each place, the best place first.
 
         excluded : keyframes that are no answer; min_score : similarity below which none is.
         A place is a keyframe with its covisible ones: one image may look alike by chance, a neighbourhood less so.
         Source: science note B2.
         """
-        score, common = self.similarity(desc)
+        allowed = np.ones(len(score), np.bool_)
         if excluded is not None:
-            score[excluded], common[excluded] = 0.0, 0
-        if not common.any():
-            return np.zeros(0, np.int32)
-        similar: Bools = (common >= COMMON_WORDS * common.max()) & (score > 0.0) & (score >= min_score)
+            allowed[excluded] = False
+        most = common[allowed].max(initial=0)
+        similar: Bools = allowed & (common > 0) & (common >= COMMON_WORDS * most) & (score >= min_score)
         chosen = np.flatnonzero(similar)
         chosen = chosen[np.argsort(-score[chosen], kind="stable")][:GROUPS_LOOKED_AT]
         groups = [self._group(int(k), score, similar) for k in chosen]
