@@ -18,8 +18,8 @@ app = typer.Typer(add_completion=False)
 
 @app.command(epilog="Example: lodelight eval out/trajectory.tum recordings/room --align se3 --json")
 def evaluate(
-    estimate: Path = typer.Argument(..., help="Trajectory file (TUM, EuRoC, KITTI) or out folder."),
-    truth: Path = typer.Argument(..., help="Trajectory file, or a recording that has ground truth."),
+    estimate: Path = typer.Argument(..., help="Trajectory file (TUM, EuRoC, KITTI), out folder or recording."),
+    truth: Path = typer.Argument(..., help="Likewise; of a recording its ground truth counts."),
     align: str = typer.Option("se3", help="se3, yaw (rotation about z), sim3 (monocular scale) or none."),
     max_dt: float = typer.Option(0.02, min=0.0, help="Largest time between an estimated pose and a true one, s."),
     as_json: bool = typer.Option(False, "--json", help="Print JSON."),
@@ -28,10 +28,10 @@ def evaluate(
     from lodelight.evaluation.compare import compare
     from lodelight.io.covariances import read_covariances
 
-    path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
-    covariances = path.parent / "covariance.csv" if path.name == "trajectory_live.tum" else None
-    known = read_covariances(covariances) if covariances and covariances.is_file() else None
-    result = compare(_read(path), _read(truth), align, max_dt, known)  # type: ignore[arg-type]  # checked there
+    covariances = estimate.with_name("covariance.csv")
+    live = estimate.name == "trajectory_live.tum" and covariances.is_file()
+    known = read_covariances(covariances) if live else None
+    result = compare(_read(estimate), _read(truth), align, max_dt, known)  # type: ignore[arg-type]  # checked there
     print(json.dumps(result.as_dict(), indent=2) if as_json else _table(result))
 
 
@@ -39,6 +39,8 @@ def _read(path: Path) -> Trajectory:
     from lodelight.errors import SourceError
     from lodelight.io.trajectories import read_trajectory
 
+    if (path / "trajectory.tum").is_file():
+        path = path / "trajectory.tum"
     if not path.is_dir():
         return read_trajectory(path)
     from lodelight.io.sources import open_source

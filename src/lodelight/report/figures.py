@@ -156,7 +156,7 @@ def plane(run: RunFolder, axes: str) -> Figure:
     traces = []
     if run.truth is not None and run.final.alignment is not None:
         xyz = _during(run.truth.xyz, run.truth.t_ns, run)
-        traces.append(line(xyz[:, i], xyz[:, j], "truth", TRUTH, line={"dash": "dash"}))
+        traces.append(line(xyz[:, i], xyz[:, j], "truth", TRUTH, opacity=0.6, line={"width": 4}))
     for path, name, colour, width in ((run.live, "live", LIVE, 1), (run.final, "final", FINAL, 2)):
         (xyz,) = broken(path.poses.t_ns, thinned(len(path.poses)), path.poses.xyz)
         traces.append(line(xyz[:, i], xyz[:, j], name, colour, line={"width": width}))

@@ -140,11 +140,10 @@ def _events(run: RunFolder) -> tuple[list[dict[str, Any]], str]:
             indices = [indices[k] for k in np.linspace(0, len(indices) - 1, MAX_EVENTS_OF_A_KIND).astype(int)]
         for i in indices:
             event = run.events[i]
-            what = ", ".join(
-                f"{k} {_word(v)}"
-                for k, v in event.items()
-                if k not in ("t_ns", "kind", "inserted") and v not in ("", None)
-            )
+            rest = {
+                k: v for k, v in event.items() if k not in ("t_ns", "kind", "inserted", "why") and v not in ("", None)
+            }
+            what = " · ".join([*filter(None, [event.get("why")]), *(f"{k} {_word(v)}" for k, v in rest.items())])
             t_s = float(run.seconds(np.array(event["t_ns"], dtype=np.int64)))
             rows.append((i, {"t_s": round(t_s, 3), "kind": kind, "what": what}))
     shown = f"Shown: {'; '.join(cut)}. " if cut else ""
