@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -61,6 +62,7 @@ class VideoRecording(Recording):
             yield Shot(t_ns, f"{self.path} frame {i}", partial(self._load, video, position, i, t_ns))
 
     def _open(self) -> cv2.VideoCapture:
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is told below, in one line
         video = cv2.VideoCapture(str(self.path))
         if not video.isOpened():
             raise SourceError(f"{self.path} is no video that can be read here; try an image folder instead")
