@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,25 +11,29 @@ from numpy.typing import NDArray
 from lodelight.types import Bools
 
 NS_PER_S = 1_000_000_000
+LATEST_NS = 1 << 62  # the year 2116; sums and differences of such stamps fit an int64
 
 
 def ns_from_seconds(text: str) -> int:
     """The nanoseconds a decimal text of seconds stands for, exactly (a float would lose 100 ns on a Unix time).
 
-    Raises ValueError where the text is no finite number.
+    Raises ValueError where the text is no number, or no time.
     """
     whole, point, fraction = text.partition(".")
-    if point and whole.isdigit() and fraction.isdigit() and len(fraction) <= 9:
+    if point and whole.isdigit() and fraction.isdigit() and len(whole) <= 10 and len(fraction) <= 9:
         return int(whole) * NS_PER_S + int(fraction.ljust(9, "0"))
     return ns_from_text(text, NS_PER_S)
 
 
 def ns_from_text(text: str, units_to_ns: int = 1) -> int:
-    """The nanoseconds of any decimal text, `1.4e18` included, rounded to the nearest."""
+    """The nanoseconds of any decimal text, `1.4e18` included, rounded to the nearest; ValueError as above."""
     try:
-        return int((Decimal(text) * units_to_ns).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError):
-        raise ValueError(f"{text!r} is no time stamp") from None
+        t_ns = (Decimal(text) * units_to_ns).to_integral_value()
+        if abs(t_ns) < LATEST_NS:
+            return int(t_ns)
+    except ArithmeticError:  # of which the errors of decimal are
+        pass
+    raise ValueError(f"{text!r} is no time stamp")
 
 
 def seconds_text(t_ns: int) -> str:
