@@ -14,7 +14,7 @@ import numpy as np
 from lodelight.compiled import kernel
 from lodelight.estimation import bundle_kernels
 from lodelight.estimation.block_cholesky import BlockPlan
-from lodelight.estimation.factors.pose_prior import add_pose_prior
+from lodelight.estimation.factors.pose_prior import PosePrior, add_pose_prior
 from lodelight.estimation.factors.reprojection import inliers_of
 from lodelight.estimation.pose import BROAD_SIGMA_M, BROAD_SIGMA_RAD
 from lodelight.geometry.cameras import Camera
@@ -24,15 +24,6 @@ from lodelight.types import AnyArray, Array, Bools, Ints
 # A step that promises less than this moves all poses together by 1e-3 of their standard deviation.
 CONVERGED_CHI2 = 1e-6
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-5, 1e-9, 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class PosePrior:
-    """What is known of a pose beforehand: information (6, 6) around `mean`, in the chart of SE3.perturbed."""
-
-    keyframe: int
-    mean: SE3
-    information: Array
 
 
 @dataclass(frozen=True, eq=False)

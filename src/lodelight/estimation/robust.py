@@ -15,3 +15,15 @@ def huber(chi2: float, bound: float) -> tuple[float, float]:
         return chi2, 1.0
     ratio = math.sqrt(bound / chi2)
     return 2.0 * ratio * chi2 - bound, ratio
+
+
+@kernel
+def dynamic_covariance(chi2: float, bound: float) -> tuple[float, float]:
+    """(cost, weight) that lets go of gross errors: quadratic up to the bound, then never above 3 bound.
+
+    Source: Agarwal et al., "Robust map optimization using dynamic covariance scaling", ICRA 2013.
+    """
+    if chi2 <= bound:
+        return chi2, 1.0
+    s = 2.0 * bound / (bound + chi2)
+    return 3.0 * bound - 2.0 * bound * s, s * s  # the cost is the integral of the weight

@@ -3,12 +3,29 @@
 r = (Log(R_mean^T R), p - p_mean), cost r^T information r: the chart of SE3.perturbed around the mean.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
 import numpy as np
 
 from lodelight.compiled import kernel
 from lodelight.geometry.dense import matmul, transposed
+from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import right_jacobian_inverse, so3_log
 from lodelight.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """What is known of a pose beforehand: information (6, 6) around `mean`, in the chart of SE3.perturbed.
+
+    keyframe : row of the pose in the problem
+    """
+
+    keyframe: int
+    mean: SE3
+    information: Array
 
 
 @kernel
