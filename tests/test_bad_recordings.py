@@ -92,6 +92,13 @@ def test_a_rig_of_another_size_is_one_error_that_says_both(tmp_path):
         numbers(open_source(write_sevenscenes(tmp_path), tiny_rig()))
 
 
+@pytest.mark.parametrize("name", ["9" * 30, "99999999999.5"])
+def test_a_number_no_clock_shows_in_an_image_name_is_told(tmp_path, name):
+    write(tmp_path / f"{name}.png", picture(0))
+    with pytest.raises(SourceError, match="no time stamp"):
+        open_source(tmp_path, tiny_rig())
+
+
 def test_an_empty_recording_is_an_error(tmp_path):
     write_tum(tmp_path / "freiburg1")
     (tmp_path / "freiburg1/rgb.txt").write_text("# color images\n")

@@ -50,9 +50,10 @@ def _order(file: Path) -> tuple[float, str]:
 def _named_stamps(files: list[Path], rig: Rig, path: Path) -> NDArray[np.int64]:
     found = [LAST_NUMBER.search(file.stem) for file in files]
     texts = [match[0] if match else "" for match in found]
+    stamps = [_stamp(str(file), text or str(i)) for i, (file, text) in enumerate(zip(files, texts, strict=True))]
+    numbers = np.array(stamps, dtype=np.int64)
     if all("." in text for text in texts):
-        return np.array([ns_from_seconds(text) for text in texts], dtype=np.int64)
-    numbers = np.array([int(text) if text.isdigit() else i for i, text in enumerate(texts)], dtype=np.int64)
+        return numbers
     if len(numbers) > 1 and np.median(np.abs(np.diff(numbers))) >= LEAST_STAMP_GAP:
         return numbers
     rate_hz = rig.cameras[0].rate_hz
@@ -68,7 +69,7 @@ def _listed_stamps(file: Path, files: list[Path]) -> NDArray[np.int64]:
     if all(len(row) == 1 for _, row in rows):
         if len(rows) != len(files):
             raise SourceError(f"{file} has {len(rows)} stamps for {len(files)} images; they must pair up")
-        return np.array([_stamp(file, number, row[0]) for number, row in rows], dtype=np.int64)
+        return np.array([_stamp(f"{file} line {number}", row[0]) for number, row in rows], dtype=np.int64)
     if short := [number for number, row in rows if len(row) < 2]:
         raise SourceError(f"{file} line {short[0]}: expected an image and its stamp")
     stems = {name: i for i, image in enumerate(files) for name in (image.name, image.stem)}
@@ -76,15 +77,16 @@ def _listed_stamps(file: Path, files: list[Path]) -> NDArray[np.int64]:
     for number, row in rows:
         name, text = (row[0], row[1]) if row[0] in stems else (row[-1], row[0])
         if Path(name).name in stems:
-            stamps[stems[Path(name).name]] = _stamp(file, number, text)
+            stamps[stems[Path(name).name]] = _stamp(f"{file} line {number}", text)
     missing = [image.name for i, image in enumerate(files) if i not in stamps]
     if missing:
         raise SourceError(f"{file} has no stamp for {missing[0]}; write `name stamp` for each image")
     return np.array([stamps[i] for i in range(len(files))], dtype=np.int64)
 
 
-def _stamp(file: Path, number: int, text: str) -> int:
+def _stamp(where: str, text: str) -> int:
+    """Seconds where there is a decimal point, else nanoseconds (or a count)."""
     try:
         return ns_from_text(text) if text.lstrip("-").isdigit() else ns_from_seconds(text)
     except ValueError:
-        raise SourceError(f"{file} line {number}: {text!r} is no time stamp") from None
+        raise SourceError(f"{where}: {text!r} is no time stamp") from None
