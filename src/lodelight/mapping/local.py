@@ -7,6 +7,7 @@ neighbourhood are adjusted together, and keyframes that add nothing go.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -143,46 +144,23 @@ class LocalMapper:
     def _fuse(self, keyframe: int) -> None:
         """Points of this keyframe and of its neighbours that are the same point become one."""
         neighbours = self._neighbours(keyframe)
+        radius_px = math.sqrt(CHI2_PX) * self.config.sigma_px
         for other in neighbours:
-            self._fuse_into(other, points_of_keyframes(self.map, np.array([keyframe], np.int32)))
-        self._fuse_into(keyframe, points_of_keyframes(self.map, np.array(neighbours, np.int32)))
+            fuse_into(
+                self.map, other, points_of_keyframes(self.map, np.array([keyframe], np.int32)), self.orb, radius_px
+            )
+        theirs = points_of_keyframes(self.map, np.array(neighbours, np.int32))
+        fuse_into(self.map, keyframe, theirs, self.orb, radius_px)
         own = self.map.points_of(keyframe)
         self.map.refresh_points(own[own >= 0], self.orb.scale_factor, self.orb.n_levels)
-
-    def _fuse_into(self, keyframe: int, points: Ints) -> None:
-        map = self.map
-        own = map.points_of(keyframe)
-        points = points[~np.isin(points, own[own >= 0])]
-        sight = in_sight(map, points, map.pose(keyframe), self.T_body_cam, self.camera, self.orb)
-        index = FeatureIndex(map.features_of(keyframe), self.camera.width, self.camera.height)
-        radius = np.sqrt(CHI2_PX) * self.config.sigma_px * self.orb.scale(sight.octave)
-        match = index.search(
-            sight.px, radius, (sight.octave - 1, sight.octave + 1), map.points.desc[sight.point], max_hamming=50
-        )
-        first = map.feature_range(keyframe).start
-        for i in np.flatnonzero(match >= 0):
-            row, new = first + int(match[i]), int(sight.point[i])
-            old = int(map.features.point[row])
-            if old < 0:
-                map.link(np.array([row]), np.array([new]))
-            elif map.points.n_obs[old] > map.points.n_obs[new]:
-                map.fuse_points(new, old)
-            else:
-                map.fuse_points(old, new)
 
     def _adjust(self, keyframe: int, stop: Callable[[], bool] | None) -> None:
         """Local bundle adjustment around a keyframe; observations that do not fit are unlinked."""
         map = self.map
         with map.lock:
             neighbours, _ = map.covisible(keyframe, self.config.min_shared)
-            window = np.append(neighbours[: self.config.window - 1], keyframe).astype(np.int32)
-            problem, keyframes, points, rows = bundle_of(map, window, self.orb, self.config.sigma_px)
-        result = bundle_adjust(problem, iterations=self.config.iterations, stop=stop)
-        with map.lock:
-            commit_bundle(map, result.R, result.p, result.xyz, problem.fixed, keyframes, points)
-            still = map.features.point[rows] == points[problem.point]
-            map.unlink(rows[~result.inliers & still])
-            map.refresh_points(points[map.points.alive[points]], self.orb.scale_factor, self.orb.n_levels)
+        window = np.append(neighbours[: self.config.window - 1], keyframe).astype(np.int32)
+        adjust(map, window, self.orb, self.config.sigma_px, self.config.iterations, stop)
 
     def _cull_keyframes(self, keyframe: int) -> None:
         map, kf = self.map, self.map.keyframes
@@ -213,6 +191,46 @@ def points_at_depth(seen: Features) -> Array:
     """(N, 3) m in the camera frame, where the features' own depths put them."""
     out: Array = seen.ray / (seen.ray[:, 2] * seen.inv_depth)[:, None]
     return out
+
+
+def fuse_into(map: Map, keyframe: int, points: Ints, orb: OrbConfig, radius_px: float) -> None:
+    """Find points in a keyframe's image, within radius_px at the finest octave of where they should be.
+
+    A feature that had no point gets one, one that had another makes the two the same.
+    """
+    own = map.points_of(keyframe)
+    points = points[~np.isin(points, own[own >= 0])]
+    spec = map.rig.cameras[0]
+    sight = in_sight(map, points, map.pose(keyframe), spec.T_body_cam, spec.camera, orb)
+    index = FeatureIndex(map.features_of(keyframe), spec.camera.width, spec.camera.height)
+    match = index.search(
+        sight.px, radius_px * orb.scale(sight.octave), (sight.octave - 1, sight.octave + 1),
+        map.points.desc[sight.point], max_hamming=50,
+    )  # fmt: skip
+    first = map.feature_range(keyframe).start
+    for i in np.flatnonzero(match >= 0):
+        row, new = first + int(match[i]), int(sight.point[i])
+        old = int(map.features.point[row])
+        if old < 0:
+            map.link(np.array([row]), np.array([new]))
+        elif map.points.n_obs[old] > map.points.n_obs[new]:
+            map.fuse_points(new, old)
+        else:
+            map.fuse_points(old, new)
+
+
+def adjust(
+    map: Map, window: Ints, orb: OrbConfig, sigma_px: float, iterations: int, stop: Callable[[], bool] | None
+) -> None:
+    """Bundle adjustment of `window` keyframes and what they see; observations that do not fit are unlinked."""
+    with map.lock:
+        problem, keyframes, points, rows = bundle_of(map, window, orb, sigma_px)
+    result = bundle_adjust(problem, iterations=iterations, stop=stop)
+    with map.lock:
+        commit_bundle(map, result.R, result.p, result.xyz, problem.fixed, keyframes, points)
+        still = map.features.point[rows] == points[problem.point]
+        map.unlink(rows[~result.inliers & still])
+        map.refresh_points(points[map.points.alive[points]], orb.scale_factor, orb.n_levels)
 
 
 def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[BundleProblem, Ints, Ints, Ints]:
