@@ -23,6 +23,10 @@ COMMANDS = {
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),
     "eval": ("lodelight.cli.evaluate", "Compare a trajectory with the truth: ATE, RPE, coverage, NEES."),
     "map": ("lodelight.cli.map", "Inspect, check and export saved maps."),
+    "bench": (
+        "lodelight.cli.bench",
+        "The benchmark table on this machine: time and error over recordings, medians and ranges.",
+    ),
 }
 
 # Typer keeps a copy of click of its own since 0.16; by this name the class is the right one in both.
