@@ -21,6 +21,7 @@ LAYERS = [
     ["messages"],
     ["geometry"],
     ["compiled", "types", "errors", "data"],
+    ["freshness"],
 ]
 # Below the estimators in the list, yet not for them: they may not import these.
 OUTSIDE = {"io", "sim", "evaluation", "report"}
