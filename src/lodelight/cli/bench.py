@@ -39,7 +39,7 @@ def bench(
     settings: list[str] = typer.Option([], "--set", help="Handed on to `lodelight run`."),
     as_json: bool = typer.Option(False, "--json", help="Print every figure of every run."),
 ) -> None:
-    """The benchmark table on this machine: time and error over recordings, medians and ranges."""
+    """Time and error over recordings on this machine: medians and ranges."""
     from lodelight.cli.progress import track
 
     with tempfile.TemporaryDirectory() as scratch:

@@ -23,10 +23,7 @@ COMMANDS = {
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),
     "eval": ("lodelight.cli.evaluate", "Compare a trajectory with the truth: ATE, RPE, coverage, NEES."),
     "map": ("lodelight.cli.map", "Inspect, check and export saved maps."),
-    "bench": (
-        "lodelight.cli.bench",
-        "The benchmark table on this machine: time and error over recordings, medians and ranges.",
-    ),
+    "bench": ("lodelight.cli.bench", "Time and error over recordings on this machine: medians and ranges."),
 }
 
 # Typer keeps a copy of click of its own since 0.16; by this name the class is the right one in both.
@@ -91,7 +88,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(2, f"{where}{error.strerror or error}; check that the path exists, is writable and has space")
     except (KeyboardInterrupt, typer.Abort):
         return _fail(130, "interrupted")
+    except SystemError as error:
+        if not _interrupted(error):
+            raise
+        return _fail(130, "interrupted")
     return status if isinstance(status, int) else 0
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether an interrupt is at the bottom of it: one that comes inside a compiled call surfaces as SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _fail(status: int, message: str) -> int:

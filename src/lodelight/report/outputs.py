@@ -5,6 +5,7 @@ Same input, same seed, same bytes; wall times stand in `metrics.json`, `frames.c
 
 from __future__ import annotations
 
+import contextlib
 import json
 import platform
 import threading
@@ -64,7 +65,7 @@ class Outputs:
                 self._events.write(line)
                 self._events.flush()
         except OSError as error:
-            raise SourceError(f"cannot write {self.out / 'events.jsonl'}: {error.strerror}; make room") from None
+            raise self._unwritten(error) from None
 
     def frame(self, estimate: Estimate, track_ms: float, map_ms: float, **details: float) -> None:
         """A frame's estimate as it was at the time; a change of state becomes an event.
@@ -135,13 +136,23 @@ class Outputs:
         return "".join(lines)
 
     def close(self) -> None:
-        self._events.close()
+        """No more events. Raises SourceError where the last of them did not reach the disk."""
+        try:
+            self._events.close()
+        except OSError as error:
+            raise self._unwritten(error) from None
+
+    def _unwritten(self, error: OSError) -> SourceError:
+        return SourceError(
+            f"cannot write {self.out / 'events.jsonl'}: {error.strerror}; make room or choose another --out"
+        )
 
     def __enter__(self) -> Outputs:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
+        with contextlib.suppress(SourceError) if error else contextlib.nullcontext():
+            self.close()
 
 
 def versions() -> dict[str, str]:
