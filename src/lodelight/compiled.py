@@ -3,10 +3,12 @@
 No fastmath and no parallel reductions: sums keep their order, so bytes repeat between runs.
 """
 
+import time
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 from numba import njit
+from numba.core import event
 
 from lodelight.freshness import source_stamp
 
@@ -21,3 +23,31 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     if cache is not None:
         cache._cache_file._source_stamp = source_stamp(function.__module__, function.__code__.co_filename)
     return cast(Callable[P, R], compiled)
+
+
+class _CompileClock(event.Listener):  # type: ignore[misc, unused-ignore]
+    """Wall time spent compiling kernels or fetching them from the cache; one kernel may compile another."""
+
+    def __init__(self) -> None:
+        self.total_s = 0.0
+        self._depth = 0
+        self._since = 0.0
+
+    def on_start(self, event: Any) -> None:
+        if self._depth == 0:
+            self._since = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.total_s += time.perf_counter() - self._since
+
+
+_clock = _CompileClock()
+event.register("numba:compiler_lock", _clock)
+
+
+def compile_seconds() -> float:
+    """Seconds this process has spent on compiling so far: to be left out of what a frame costs."""
+    return _clock.total_s

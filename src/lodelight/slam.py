@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from lodelight.compiled import compile_seconds
 from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
+from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording
 from lodelight.localization.machine import LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
@@ -19,9 +22,11 @@ from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig
 from lodelight.mapping.map import Map
+from lodelight.mapping.worker import InlineMapping, ThreadedMapping
 from lodelight.messages import Estimate, Frame, Message
 from lodelight.rig import Rig
 from lodelight.trajectory import Trajectory
+from lodelight.types import Array
 
 EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
 FOREVER_NS = 10**18
@@ -33,6 +38,7 @@ class SlamConfig:
     """Every default of the system, by stage. min_start_points : close points below which no map is begun."""
 
     sensors: str = "rgbd"
+    seed: int = 0
     min_start_points: int = 50
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackerConfig = field(default_factory=TrackerConfig)
@@ -52,8 +58,11 @@ class PathNode:
 class Slam:
     """Simultaneous localization and mapping with RGB-D or stereo.
 
-    `run` streams a recording; `feed` takes one message at a time, for live use. `map` is the map so far; a given one
-    is continued.
+    `run` streams a recording; `feed` takes one message at a time, for live use; `close` waits for mapping to end.
+    map : the map so far; a given one is continued
+    live : mapping on its own thread; else everything is done in order, the same bytes every time
+    on_event : told of every decision, as on_event(t_ns, kind, **fields), from either thread
+    mapping_ms : wall time of every keyframe's mapping so far
     """
 
     def __init__(
@@ -63,26 +72,41 @@ class Slam:
         map: Map | None = None,
         gates: tuple[Gate, ...] = (),
         on_event: EventSink | None = None,
+        live: bool = False,
     ) -> None:
         self.config = config or SlamConfig()
         self.map = map if map is not None else Map(rig)
         self.gates = gates
         self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
-        self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking)
+        self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking, self.config.seed)
         self.relocalizer = Relocalizer(self.map, self.config.orb)
         self.machine = LocalizationMachine(self.tracker, self.relocalizer.find)
         self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
+        self.live = live
+        self.mapping = (ThreadedMapping if live else InlineMapping)(self._map)
+        self.mapping_ms: list[float] = []
         self.path: list[PathNode] = []
+        self.relocalizations = 0
+        self.dropped = 0
         self._last_keyframe_ns = -FOREVER_NS
         self._relocalized_ns = -FOREVER_NS
+        self._peak_inliers = 0  # of the frames since the last keyframe
 
     def run(self, recording: Recording, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Estimate]:
         """Estimates of all frames of a recording, as a robot would have had them at the time."""
-        for message in recording.messages(self.config.sensors, start_s, end_s):
+        messages = recording.messages(self.config.sensors, start_s, end_s)
+        if self.live:
+            messages = iter(Paced(messages, self._dropped))
+        for message in messages:
             estimate = self.feed(message)
             if estimate is not None:
                 yield estimate
+        self.close()
+
+    def close(self) -> None:
+        """Wait until the last keyframe is mapped."""
+        self.mapping.close()
 
     def feed(self, message: Message) -> Estimate | None:
         """One message; an estimate for every frame."""
@@ -90,16 +114,21 @@ class Slam:
 
     def step(self, frame: Frame) -> Estimate:
         """One frame: see it, locate it, decide whether it becomes a keyframe, map."""
+        clock = Stopwatch()
         seen = self.front_end.process(frame)
         if len(self.map.keyframes) == 0:
-            return self._begin(frame.t_ns, seen)
-        tracked = self.machine.locate(frame.t_ns, seen)
-        if self.machine.status == "relocalized":
+            return self._begin(frame.t_ns, seen, clock)
+        with self.map.lock:
+            tracked = self.machine.locate(frame.t_ns, seen)
+            estimate = self._estimate(tracked, clock)
+        if estimate.status == "relocalized":
             self._relocalized_ns = frame.t_ns
-        estimate = self._estimate(tracked)
+            self.relocalizations += 1
         if estimate.localized:
             self.path.append(PathNode(tracked.t_ns, tracked.reference, tracked.T_reference_body))
-            decision = decide(self._candidate(tracked), self.config.keyframes, self.gates)
+            with self.map.lock:
+                candidate = self._candidate(tracked)
+            decision = decide(candidate, self.config.keyframes, self.gates)
             self.emit(frame.t_ns, "keyframe", inserted=decision.insert, why=decision.why, weight=decision.weight)
             if decision.insert:
                 self._insert(tracked, decision)
@@ -112,49 +141,91 @@ class Slam:
             [self.map.pose(node.reference) @ node.T_reference_body for node in self.path],
         )
 
+    def cloud(self) -> Array:
+        """(N, 3) m, world: the map's points."""
+        return self.map.points.xyz[self.map.alive_points]
+
+    def stats(self) -> dict[str, int]:
+        """Counts for `metrics.json`."""
+        return {
+            "keyframes": len(self.map.alive_keyframes),
+            "map_points": len(self.map.alive_points),
+            "loops": len(self.map.loops),
+            "relocalizations": self.relocalizations,
+            "dropped": self.dropped,
+        }
+
+    def _dropped(self, t_ns: int) -> None:
+        self.dropped += 1
+        self.emit(t_ns, "dropped", why="the frames before it took too long")
+
     # -- parts --------------------------------------------------------------------------------------------------
 
-    def _begin(self, t_ns: int, seen: Features) -> Estimate:
+    def _begin(self, t_ns: int, seen: Features, clock: Stopwatch) -> Estimate:
         """The first keyframe of a new map, at the origin, if enough of what it sees has a depth."""
         close = int(np.count_nonzero(self.mapper.close(seen)))
         if close < self.config.min_start_points:
             why = f"{close} of {len(seen)} corners have depth, {self.config.min_start_points} are needed to begin a map"
-            return Estimate(t_ns, "initializing", SE3.identity(), LOST_COVARIANCE, why)
+            return Estimate(t_ns, "initializing", SE3.identity(), LOST_COVARIANCE, why, 0, {"track_ms": clock.ms()})
         nothing = np.full(len(seen), -1, np.int32)
         first = Tracked(t_ns, seen, SE3.identity(), np.zeros((6, 6)), nothing, reference=0)
+        self.emit(t_ns, "keyframe", inserted=True, why="the first", weight=1.0)
         self._insert(first, Decision(True, "the first"))
         self.machine.start(first)
         self.path.append(PathNode(t_ns, 0, SE3.identity()))
-        return self._estimate(first)
+        return self._estimate(first, clock)
 
     def _insert(self, tracked: Tracked, decision: Decision) -> None:
-        parent = tracked.reference if len(self.map.keyframes) else -1
-        keyframe = self.mapper.insert(
-            tracked.t_ns, tracked.T_world_body, tracked.seen, tracked.point, decision.weight, parent
-        )
-        tracked.point[:] = self.map.points_of(keyframe)
+        """The quick half of mapping, which the next frame needs; the rest is the worker's."""
+        with self.map.lock:
+            parent = tracked.reference if len(self.map.keyframes) else -1
+            keyframe = self.mapper.insert(
+                tracked.t_ns, tracked.T_world_body, tracked.seen, tracked.point, decision.weight, parent
+            )
+            tracked.point[:] = self.map.points_of(keyframe)
         self._last_keyframe_ns = tracked.t_ns
-        self.mapper.process(keyframe)
+        self._peak_inliers = 0
+        self.mapping.submit(keyframe)
+
+    def _map(self, keyframe: int) -> None:
+        clock = Stopwatch()
+        self.mapper.process(keyframe, self.mapping.interrupted)
+        self.mapping_ms.append(clock.ms())
 
     def _candidate(self, tracked: Tracked) -> Candidate:
         n_keyframes = int(np.count_nonzero(self.map.keyframes.alive))
         expected = self.map.points_of(tracked.reference)
         expected = expected[expected >= 0]
-        min_sightings = 3 if n_keyframes > 2 else 2
+        min_sightings = 2 if n_keyframes > 2 else 1
+        confirmed = int(np.count_nonzero(self.map.points.n_obs[expected] >= min_sightings))
+        self._peak_inliers = max(self._peak_inliers, tracked.n_inliers)
         close = self.mapper.close(tracked.seen)
         return Candidate(
             t_ns=tracked.t_ns,
             inliers=tracked.n_inliers,
-            reference_points=int(np.count_nonzero(self.map.points.n_obs[expected] >= min_sightings)),
+            reference_points=max(confirmed, self._peak_inliers),
             close_tracked=int(np.count_nonzero(close & (tracked.point >= 0))),
             close_untracked=int(np.count_nonzero(close & (tracked.point < 0))),
             n_keyframes=n_keyframes,
             since_keyframe_s=(tracked.t_ns - self._last_keyframe_ns) * 1e-9,
             since_relocalization_s=(tracked.t_ns - self._relocalized_ns) * 1e-9,
+            mapping_idle=self.mapping.idle,
+            queue=self.mapping.queued,
         )
 
-    def _estimate(self, tracked: Tracked) -> Estimate:
+    def _estimate(self, tracked: Tracked, clock: Stopwatch) -> Estimate:
         covariance = LOST_COVARIANCE if tracked.why_lost else tracked.covariance
         return Estimate(
-            tracked.t_ns, self.machine.status, tracked.T_world_body, covariance, self.machine.why, tracked.n_inliers
-        )
+            tracked.t_ns, self.machine.status, tracked.T_world_body, covariance, self.machine.why,
+            tracked.n_inliers, {"track_ms": clock.ms()},
+        )  # fmt: skip
+
+
+class Stopwatch:
+    """Wall time since it was made, without what went into compiling kernels."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter() - compile_seconds()
+
+    def ms(self) -> float:
+        return 1e3 * (time.perf_counter() - compile_seconds() - self._start)

@@ -1,36 +1,50 @@
-"""Depth of corners from a depth image, with the sensor's noise."""
+"""Depth of corners from a depth image, with the noise of the sensor and of its registration."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from lodelight.compiled import kernel
 from lodelight.features.features import Features
 from lodelight.rig import DepthSpec
 from lodelight.types import ArrayF32
 
-# A corner on the rim of an object has two depths around it, and belongs to the nearer: the rim is the object's.
-_RIM = 0.05  # a spread of depths around the corner above this share of the depth makes it a rim
+# A depth pixel belongs to an image pixel only to within this: calibration of the two lenses against each other, and
+# their shutters, which consumer sensors do not open together.
+MISREGISTRATION_PX = 2
+# Scale error of a factory-calibrated sensor, as a share of the depth.
+SCALE_ERROR = 0.005
 
 
 def depth_of_features(features: Features, depth: ArrayF32, spec: DepthSpec) -> Features:
     """Features with inverse depth and its sigma, read at the nearest pixel of `depth` (H, W) m; 0 = no reading.
 
-    On a rim the smallest depth of the 3x3 neighbourhood is taken, with the rim's half spread as its noise.
-    sigma_z = a + b (z - c)^2 of the rig's depth sensor; sigma of 1/z is sigma_z / z^2.
+    sigma_z^2 = (a + b (z - c)^2)^2 + (scale error z)^2 + (half the spread of depths around)^2: where the depth changes
+    from pixel to pixel, as on the rim of an object, a misregistered reading says little.
     """
-    height, width = depth.shape
-    u = np.clip(np.rint(features.px[:, 0]).astype(int), 1, width - 2)
-    v = np.clip(np.rint(features.px[:, 1]).astype(int), 1, height - 2)
-    offsets = np.array([-1, 0, 1])
-    around = depth[v[:, None, None] + offsets[None, :, None], u[:, None, None] + offsets[None, None, :]].reshape(-1, 9)
-    centre = around[:, 4]
-    nearest = np.where(around > 0, around, np.inf).min(axis=1)
-    spread = around.max(axis=1) - nearest
-    rim = (centre > 0) & (spread > _RIM * centre)
-    z = np.where(rim, nearest, centre)
+    z, spread = _read(features.px, depth)
     a, b, c = spec.noise
-    sigma_z = a + b * (z - c) ** 2
-    sigma_z = np.where(rim, np.hypot(sigma_z, 0.5 * spread), sigma_z)
-    known = z > 0
-    inv_depth = np.divide(1.0, z, out=np.zeros_like(z), where=known)
-    return features.with_depth(inv_depth.astype(np.float32), (sigma_z * inv_depth**2).astype(np.float32))
+    sigma_z = np.sqrt((a + b * (z - c) ** 2) ** 2 + (SCALE_ERROR * z) ** 2 + (0.5 * spread) ** 2)
+    inv_depth = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
+    return features.with_depth(inv_depth, sigma_z * inv_depth**2)
+
+
+@kernel
+def _read(px: ArrayF32, depth: ArrayF32) -> tuple[ArrayF32, ArrayF32]:
+    """Depth (N,) m at the nearest pixel, and the spread of the readings around it."""
+    height, width = depth.shape
+    z, spread = np.zeros(len(px), np.float32), np.zeros(len(px), np.float32)
+    for i in range(len(px)):
+        u = min(max(round(px[i, 0]), 0), width - 1)
+        v = min(max(round(px[i, 1]), 0), height - 1)
+        z[i] = depth[v, u]
+        if z[i] == 0.0:
+            continue
+        low = high = z[i]
+        for y in range(max(v - MISREGISTRATION_PX, 0), min(v + MISREGISTRATION_PX, height - 1) + 1):
+            for x in range(max(u - MISREGISTRATION_PX, 0), min(u + MISREGISTRATION_PX, width - 1) + 1):
+                d = depth[y, x]
+                if d > 0.0:
+                    low, high = min(low, d), max(high, d)
+        spread[i] = high - low
+    return z, spread

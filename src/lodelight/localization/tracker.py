@@ -17,6 +17,11 @@ from lodelight.mapping.sight import in_sight, local_keyframes, points_of_keyfram
 from lodelight.rig import Rig
 from lodelight.types import AnyArray, Array, ArrayF32, Ints, Words
 
+MAX_DEPTH_RATIO = 0.5  # a prediction of where things are is not wrong by half of their depth
+MIN_DEPTH_M = 0.1
+CLOSE_SIGMA = 0.05  # of a depth, as a share of it, up to which a point is put there
+MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
+
 
 @dataclass(frozen=True)
 class TrackerConfig:
@@ -62,13 +67,23 @@ class Landmarks:
     angle: ArrayF32
 
 
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A pose from matches. point : (N,) map point of every feature that agrees, or -1; tried : matches there were."""
+
+    solved: PoseResult
+    point: Ints
+    tried: int
+
+
 class Tracker:
     """Follows the camera in a map that others write. Keeps only the last frame and the motion between the last two."""
 
-    def __init__(self, rig: Rig, map: Map, orb: OrbConfig, config: TrackerConfig) -> None:
+    def __init__(self, rig: Rig, map: Map, orb: OrbConfig, config: TrackerConfig, seed: int = 0) -> None:
         self.map = map
         self.orb = orb
         self.config = config
+        self.seed = seed
         self.camera = rig.cameras[0].camera
         self.T_body_cam = rig.cameras[0].T_body_cam
         self.last: Tracked | None = None
@@ -79,8 +94,8 @@ class Tracker:
     def track(self, t_ns: int, seen: Features) -> Tracked:
         """Pose of a frame that follows the last one; `why_lost` says what failed where it is not empty.
 
-        Three ways to a first pose, each tried where the one before found too little: the last frame's points where
-        the motion model puts them, the same by descriptor alone, and the reference keyframe's by descriptor.
+        Three ways to a first pose, each tried where the one before does not convince: the last frame's points near
+        where the motion model puts them, the same by descriptor alone, and the reference keyframe's by descriptor.
         """
         assert self.last is not None
         last = self.last
@@ -88,17 +103,17 @@ class Tracker:
         predicted = self._predict(T_world_last, t_ns)
         index = FeatureIndex(seen, self.camera.width, self.camera.height)
         recent = self._landmarks_of_frame(last, T_world_last)
-        match = self._match_predicted(recent, predicted, index)
-        point, solved = self._fit(predicted, seen, recent, match)
-        if solved.n_inliers < self.config.min_matches:
+        pairs = self._match_predicted(recent, predicted, index)
+        fit = self._fit(predicted, seen, recent, pairs)
+        if not self._convincing(fit):
             for landmarks in (recent, self._landmarks_of_keyframe(last.reference)):
-                guess, match = self._match_blindly(landmarks, seen)
-                point, solved = self._fit(guess or predicted, seen, landmarks, match)
-                if solved.n_inliers >= self.config.min_matches:
+                pairs = self._match_blindly(landmarks, seen)
+                fit = max(fit, self._fit(predicted, seen, landmarks, pairs), key=lambda f: f.solved.n_inliers)
+                if self._convincing(fit):
                     break
-            else:
-                return self._lost(t_ns, seen, predicted, f"{solved.n_inliers} of {len(match)} matches fit one pose")
-        return self.refine(t_ns, seen, solved.T_world_body, point, index, search=3.0)
+        if fit.solved.n_inliers < self.config.min_matches:
+            return self._lost(t_ns, seen, predicted, f"{fit.solved.n_inliers} of {fit.tried} matches fit one pose")
+        return self.refine(t_ns, seen, fit.solved.T_world_body, fit.point, index, search=3.0)
 
     def refine(
         self, t_ns: int, seen: Features, T_world_body: SE3, point: Ints, index: FeatureIndex, search: float
@@ -108,7 +123,8 @@ class Tracker:
         point : (N,) matches so far; search : window in units of a corner's own scale
         """
         map, orb = self.map, self.orb
-        voting = local_keyframes(map, point)
+        reference = self.last.reference if self.last else 0
+        voting = local_keyframes(map, point, otherwise=reference)
         local = points_of_keyframes(map, voting)
         sight = in_sight(map, local, T_world_body, self.T_body_cam, self.camera, orb)
         map.points.n_visible[sight.point] += 1
@@ -124,8 +140,7 @@ class Tracker:
         solved = self._solve(T_world_body, seen.take(used), map.points.xyz[point[used]])
         point[used[~solved.inliers]] = -1
         map.points.n_found[point[point >= 0]] += 1
-        reference = int(voting[0]) if len(voting) else self.last.reference if self.last else 0
-        tracked = Tracked(t_ns, seen, solved.T_world_body, solved.covariance, point, reference)
+        tracked = Tracked(t_ns, seen, solved.T_world_body, solved.covariance, point, int(voting[0]))
         if tracked.n_inliers < self.config.min_inliers:
             tracked.why_lost = f"{tracked.n_inliers} of {len(used)} matches with the local map are inliers"
         return tracked
@@ -159,7 +174,7 @@ class Tracker:
         """What a frame saw: its map points, and features with a depth but no map point, put where that depth says."""
         seen = frame.seen
         point = self.map.surviving(frame.point)
-        use = np.flatnonzero((point >= 0) | (seen.inv_depth > 0))
+        use = np.flatnonzero((point >= 0) | (seen.sigma_inv_depth < CLOSE_SIGMA * seen.inv_depth))
         seen, point = seen.take(use), point[use]
         depth = 1.0 / np.where(seen.inv_depth > 0, seen.inv_depth, 1.0)
         xyz = (T_world_body @ self.T_body_cam) @ (seen.ray * (depth / seen.ray[:, 2])[:, None])
@@ -181,31 +196,43 @@ class Tracker:
         match = index.search(px[use], radius, (octave - 1, octave + 1), landmarks.desc[use], ratio=0.9)
         return _pairs(use, match, landmarks, index.features)
 
-    def _match_blindly(self, landmarks: Landmarks, seen: Features) -> tuple[SE3 | None, Ints]:
-        """Pose and rows (landmark, feature) that agree with it, by descriptors alone."""
-        everything = np.arange(len(landmarks.point))
+    def _match_blindly(self, landmarks: Landmarks, seen: Features) -> Ints:
+        """(M, 2) rows (landmark, feature) by descriptors alone."""
         match = match_descriptors(landmarks.desc, seen.desc, max_hamming=64, ratio=0.8)
-        pairs = _pairs(everything, match, landmarks, seen)
-        sigma_rad = self._sigma_px(seen)[pairs[:, 1]] / self.camera.focal_px
-        found = ransac_pnp(seen.ray[pairs[:, 1]], landmarks.xyz[pairs[:, 0]], sigma_rad, seed=0)
-        if found is None:
-            return None, pairs
-        T_world_cam, inliers = found
-        return T_world_cam @ self.T_body_cam.inverse(), pairs[inliers]
+        return _pairs(np.arange(len(landmarks.point)), match, landmarks, seen)
 
-    def _fit(self, start: SE3, seen: Features, landmarks: Landmarks, pairs: Ints) -> tuple[Ints, PoseResult]:
-        """Map point (N,) of every feature that agrees with the pose, and the pose."""
-        solved = self._solve(start, seen.take(pairs[:, 1]), landmarks.xyz[pairs[:, 0]])
+    def _fit(self, start: SE3, seen: Features, landmarks: Landmarks, pairs: Ints) -> Fit:
+        """The pose that most of the pairs agree with, looked for around `start`, then from random samples of them.
+
+        Around a prediction that is far off, wrong matches are the nearest: they hold a local optimization there.
+        """
+        feature, xyz = seen.take(pairs[:, 1]), landmarks.xyz[pairs[:, 0]]
+        solved = self._solve(start, feature, xyz)
+        if solved.n_inliers < MAJORITY * len(pairs):
+            drawn = ransac_pnp(feature.ray, xyz, self._sigma_px(feature) / self.camera.focal_px, self.seed)
+            if drawn is not None:
+                other = self._solve(drawn[0] @ self.T_body_cam.inverse(), feature, xyz)
+                solved = max(solved, other, key=lambda s: s.n_inliers)
         agreed = pairs[solved.inliers]
         point = np.full(len(seen), -1, np.int32)
         point[agreed[:, 1]] = landmarks.point[agreed[:, 0]]
-        return point, solved
+        return Fit(solved, point, len(pairs))
+
+    def _convincing(self, fit: Fit) -> bool:
+        return fit.solved.n_inliers >= max(self.config.min_matches, MAJORITY * fit.tried)
 
     def _solve(self, start: SE3, seen: Features, xyz: Array) -> PoseResult:
-        """Motion-only optimization of features against their world positions (N, 3)."""
+        """Motion-only optimization of features against their world positions (N, 3).
+
+        Pairs of which the start already says that one is much farther than the other are put out of reach first: a
+        wrong match close to the camera has a hold on the pose that no robust kernel takes from it.
+        """
+        z = ((start @ self.T_body_cam).inverse() @ xyz)[:, 2]
+        unlike = (seen.inv_depth > 0) & (np.abs(z * seen.inv_depth - 1.0) > MAX_DEPTH_RATIO)
+        weight = np.where(unlike | (z < MIN_DEPTH_M), 0.0, 1.0)
         return optimize_pose(
             start, self.T_body_cam, self.camera, xyz, seen.px, self._sigma_px(seen),
-            seen.inv_depth, seen.sigma_inv_depth,
+            seen.inv_depth, seen.sigma_inv_depth, information_weight=weight,
         )  # fmt: skip
 
     def _sigma_px(self, seen: Features) -> Array:

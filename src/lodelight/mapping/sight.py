@@ -34,11 +34,16 @@ class Sight:
     cosine: Array
 
 
-def local_keyframes(map: Map, points: Ints) -> Ints:
-    """Keyframes that see the given points (-1 = none), most first, then their best neighbours, parents included."""
+def local_keyframes(map: Map, points: Ints, otherwise: int) -> Ints:
+    """Keyframes that see the given points (-1 = none), most first, then their best neighbours and their parents.
+
+    otherwise : the keyframe to begin with where no point is given
+    """
     votes = map.shared_counts(points)
     voters = np.flatnonzero(votes)
     voters = voters[np.argsort(-votes[voters], kind="stable")][:MAX_KEYFRAMES]
+    if len(voters) == 0:
+        voters = np.array([otherwise])
     chosen = dict.fromkeys(int(k) for k in voters)
     for k in voters[:NEIGHBOURS_OF]:
         if len(chosen) >= MAX_KEYFRAMES:

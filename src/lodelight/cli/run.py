@@ -1,0 +1,91 @@
+"""`lodelight run`."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from lodelight.io.recording import Recording
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(epilog="Example: lodelight run recordings/room --out out/room --sensors rgbd")
+def run(
+    source: Path = typer.Argument(..., help="Recording: EuRoC, TUM RGB-D, KITTI, 7-Scenes folder, images or video."),
+    out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
+    sensors: str = typer.Option("", help="stereo or rgbd; default: the most the source has."),
+    rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
+    map_file: Path = typer.Option(None, "--map", help="Continue this saved map."),
+    live: bool = typer.Option(False, "--live", help="Pace by the stamps, mapping on its own thread."),
+    start: float = typer.Option(0.0, min=0.0, help="Seconds after the first frame."),
+    end: float = typer.Option(float("inf"), help="Seconds after the first frame."),
+    seed: int = typer.Option(0, help="Seed of every random draw."),
+    settings: list[str] = typer.Option([], "--set", help="section.key=value, for example mapping.window=30."),
+    as_json: bool = typer.Option(False, "--json", help="Print metrics.json."),
+) -> None:
+    """SLAM over a recording: trajectory, map and report."""
+    import cv2
+
+    from lodelight.cli.progress import track
+    from lodelight.compiled import compile_seconds
+    from lodelight.errors import RunError
+    from lodelight.io.sources import open_source
+    from lodelight.mapping.store import load_map, save_map
+    from lodelight.report.outputs import Outputs
+    from lodelight.settings import as_table, with_settings
+    from lodelight.slam import Slam, SlamConfig
+
+    cv2.setNumThreads(1)  # whole stages run on two threads; image operations that split further only get in the way
+    recording = open_source(source, rig)
+    config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), settings)
+    known = load_map(map_file) if map_file else None
+    asked = {"source": str(source), "live": live, "start_s": start, "map": str(map_file) if map_file else None}
+    with Outputs(out, {"run": asked, **as_table(config)}) as outputs:
+        begun_s, compiled_s = time.perf_counter(), compile_seconds()
+        slam = Slam(recording.rig, config, map=known, on_event=outputs.event, live=live)
+        mapped, stamps = 0, [0]
+        for estimate in track(slam.run(recording, start, end), "SLAM", recording.n_frames):
+            outputs.frame(estimate, estimate.details["track_ms"], sum(slam.mapping_ms[mapped:]))
+            mapped = len(slam.mapping_ms)
+            stamps = [stamps[0] or estimate.t_ns, estimate.t_ns]
+        wall_s = time.perf_counter() - begun_s
+        for skipped in recording.skipped:
+            outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)
+        save_map(slam.map, out / "map.lode")
+        metrics = outputs.finish(
+            slam.trajectory(), slam.cloud(), {**slam.stats(), "skipped": len(recording.skipped)},
+            recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
+            recording_s=(stamps[-1] - stamps[0]) * 1e-9,
+        )  # fmt: skip
+    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out))
+    if metrics["tracked_fraction"] == 0.0:
+        raise RunError(f"{source}: no frame could be localized; {out / 'events.jsonl'} says why")
+
+
+def _visual(recording: Recording) -> str:
+    """The most a recording has of what this version can use."""
+    return recording.rig.sensors.removesuffix("-inertial")
+
+
+def _summary(m: dict[str, Any], out: Path) -> str:
+    lines = [
+        f"{m['frames']} frames, {100 * m['tracked_fraction']:.1f} % localized, {m['keyframes']} keyframes, "
+        f"{m['map_points']} points, {m['loops']} loops, {m['relocalizations']} relocalizations",
+    ]
+    per_frame = m["ms_per_frame"]
+    if per_frame["mean"] is not None and m["real_time_factor"] is not None:
+        lines.append(
+            f"{per_frame['mean']:.1f} ms a frame (p95 {per_frame['p95']:.1f}), real-time factor "
+            f"{m['real_time_factor']:.2f}, {m['peak_rss_mb']:.0f} MB"
+        )
+    for name in ("final", "live"):
+        if m["ate"] and m["ate"][name]:
+            error = m["ate"][name]
+            lines.append(f"ATE {name} {error['rmse_m']:.4f} m, {error['rotation_deg']:.2f} deg ({error['align']})")
+    return "\n".join([*lines, f"report: {out / 'report.html'}"])
