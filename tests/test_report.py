@@ -5,10 +5,15 @@ import re
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 
 from lodelight.errors import SourceError
+from lodelight.geometry.se3 import SE3
+from lodelight.messages import Estimate
 from lodelight.report.html import MAX_EVENTS_OF_A_KIND, write_report
+from lodelight.report.outputs import Outputs
+from lodelight.trajectory import Trajectory
 from out_folder import make_run, walk
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -109,3 +114,14 @@ def test_an_incomplete_folder_is_one_clear_error(tmp_path):
     (tmp_path / "frames.csv").unlink()
     with pytest.raises(SourceError, match=r"no complete out folder .*frames\.csv"):
         write_report(tmp_path, walk(30))
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_a_run_that_saw_next_to_nothing_has_a_report_too(tmp_path, frames):
+    stamps = [1_700_000_000_000_000_000 + i * 33_333_333 for i in range(frames)]
+    with Outputs(tmp_path, {}) as outputs:
+        for t_ns in stamps:
+            outputs.frame(Estimate(t_ns, "tracking", SE3.identity(), np.eye(6)), 1.0, 0.0)
+        path = Trajectory.from_poses(stamps, [SE3.identity()] * frames)
+        outputs.finish(path, np.zeros((0, 3)), {}, walk(30), wall_s=1.0, compile_s=0.0, recording_s=0.0)
+    assert "Tracked" in (tmp_path / "report.html").read_text()
