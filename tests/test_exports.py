@@ -5,7 +5,7 @@ import sys
 
 import lodelight
 
-NAMES = {"__version__", "open_source"}
+NAMES = {"Slam", "SlamConfig", "__version__", "open_source"}
 
 
 def test_public_names_are_the_stated_ones():

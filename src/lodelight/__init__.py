@@ -4,11 +4,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lodelight.io.sources import open_source as open_source
+    from lodelight.slam import Slam as Slam
+    from lodelight.slam import SlamConfig as SlamConfig
 
 __version__ = "0.1.0"
 
 # Imported at first use, so that `import lodelight` costs nothing.
 _EXPORTS = {
+    "Slam": "lodelight.slam",
+    "SlamConfig": "lodelight.slam",
     "open_source": "lodelight.io.sources",
 }
 __all__ = ["__version__", *_EXPORTS]
