@@ -86,12 +86,14 @@ def bundle_adjust(
     iterations : at most so many with all observations, under Huber's kernel if `robust`
     polish : then so many without kernel on the inliers alone (the two stages of local adjustment: 5 and 10)
     stop : asked between iterations; the best state so far is returned
-    covariance_of : keyframes whose marginal covariance is wanted, with all points uncertain
+    covariance_of : keyframes whose marginal covariance is wanted, with all points uncertain; it counts what the last
+        stage counted, and after a robust one the inliers
     """
     adjustment = _Adjustment(problem)
     adjustment.run(iterations, robust, stop)
-    if polish:
+    if robust or polish:
         adjustment.active = adjustment.inliers
+    if polish:
         adjustment.run(polish, False, stop)
     return adjustment.result(covariance_of)
 
@@ -236,7 +238,6 @@ class _Adjustment:
         wanted = np.flatnonzero(self.position[keyframes] >= 0)
         if len(wanted) == 0:
             return out
-        self.active = self.inliers
         self._linearize(self.state, self.linear, False, self.linear.chi2)
         broad = 1.0 / np.repeat([BROAD_SIGMA_RAD**2, BROAD_SIGMA_M**2], 3)
         self.linear.U[:, range(6), range(6)] += broad

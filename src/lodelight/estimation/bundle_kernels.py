@@ -35,7 +35,7 @@ def linearize(
     Returns the cost, and the cost comparable with `before`: over the observations seen there, with those that left
     the view at the cost they had. So a step is neither rewarded for losing points nor stopped by one.
     """
-    E = np.zeros((2, 3))
+    E, Rk, pk = np.zeros((2, 3)), np.empty((3, 3)), np.empty(3)
     U[:] = 0.0
     g_pose[:] = 0.0
     V[:] = 0.0
@@ -43,8 +43,12 @@ def linearize(
     cost = comparable = 0.0
     for i in range(len(keyframe)):
         k, m = keyframe[i], point[i]
+        for a in range(3):  # a copy costs less than a view, which counts its references
+            pk[a] = p[k, a]
+            for b in range(3):
+                Rk[a, b] = R[k, a, b]
         rows, r, Ju, Jv, Jd = reprojection(
-            model, params, R[k], p[k], R_body_cam, p_body_cam, xyz[m, 0], xyz[m, 1], xyz[m, 2], px[i, 0], px[i, 1],
+            model, params, Rk, pk, R_body_cam, p_body_cam, xyz[m, 0], xyz[m, 1], xyz[m, 2], px[i, 0], px[i, 1],
             sigma_px[i], inv_depth[i], sigma_inv_depth[i], E,
         )  # fmt: skip
         bound = math.inf if not robust else CHI2_PX_DEPTH if inv_depth[i] > 0.0 else CHI2_PX

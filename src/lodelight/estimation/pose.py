@@ -19,7 +19,7 @@ from lodelight.estimation.robust import huber
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.dense import cholesky, cholesky_solve, matmul, spd_inverse
 from lodelight.geometry.se3 import SE3
-from lodelight.geometry.so3 import so3_exp
+from lodelight.geometry.so3 import matrix_from_quat_wxyz, quat_wxyz_from_matrix, so3_exp
 from lodelight.types import AnyArray, Array, Bools
 
 ROUNDS = 4
@@ -77,6 +77,8 @@ def optimize_pose(
         np.ones(n) if information_weight is None else _f64(information_weight),
         _f64(mean.R), _f64(mean.t), _f64(information), prior is not None,
     )  # fmt: skip
+    # Back onto SO(3): a motion model that inverts by transposing would more than double what rounding left, each frame.
+    R = matrix_from_quat_wxyz(quat_wxyz_from_matrix(R))
     return PoseResult(SE3(R, p), covariance, inliers, chi2)
 
 
