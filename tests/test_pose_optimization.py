@@ -85,6 +85,21 @@ def test_pose_is_exact_without_noise(lens):
     assert result.n_inliers == 100
 
 
+def test_poses_predicted_from_poses_stay_rotations():
+    """Constant velocity inverts by transposing, so what rounding leaves of a rotation would grow 2.4 times a frame."""
+    rng = np.random.default_rng(14)
+    camera, step = LENSES["radtan"], SE3.exp(np.array([0.0, 0.01, 0.0, 0.01, 0.0, 0.0]))
+    before = random_pose(rng)
+    now = before @ step
+    for _ in range(100):
+        truth = now @ step
+        view = random_view(rng, truth, camera, 20, noise=0.0)
+        predicted = now @ (before.inverse() @ now)
+        result = optimize_pose(predicted, T_BODY_CAM, camera, *view.observations)
+        before, now = now, result.T_world_body
+    assert np.abs(now.R.T @ now.R - np.eye(3)).max() < 1e-14  # rounding of one product; 1e22 before this was found
+
+
 def test_pose_agrees_with_opencv():
     rng = np.random.default_rng(4)
     camera = Camera.create("radtan", 752, 480, (458.0, 457.0, 367.0, 248.0), (-0.28, 0.074, 2e-4, 1.8e-5))
@@ -154,6 +169,17 @@ def test_points_behind_the_camera_are_outliers():
     assert not result.inliers[:10].any()
     assert np.all(np.isinf(result.chi2[:10]))
     assert result.n_inliers > 40
+
+
+def test_what_is_not_a_number_is_not_seen():
+    rng = np.random.default_rng(12)
+    T = random_pose(rng)
+    view = random_view(rng, T, LENSES["double_sphere"], 60)
+    view.xyz[3], view.px[7, 1] = np.nan, np.nan
+    result = optimize_pose(T, T_BODY_CAM, LENSES["double_sphere"], *view.observations)
+    assert not result.inliers[[3, 7]].any()
+    assert result.n_inliers > 45
+    assert np.isfinite(result.covariance).all()
 
 
 def test_a_prior_pulls_by_its_information():
