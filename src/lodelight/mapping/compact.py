@@ -6,7 +6,8 @@ import numpy as np
 
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
-from lodelight.types import AnyArray, Bools, Ints
+from lodelight.mapping.table import Table
+from lodelight.types import Bools, Ints
 
 # Columns that hold row numbers, and of which table.
 REFERENCES = {
@@ -28,17 +29,19 @@ def compacted(map: Map) -> Map:
     new_number = {name: _numbers(kept) for name, kept in keep.items()}
     small = Map(map.rig)
     for name, table in small.tables.items():
-        columns = {column: values[keep[name]] for column, values in map.tables[name].columns.items()}
-        if name == "points":
-            columns["first_keyframe"] = heir[columns["first_keyframe"]]
-        elif name == "loops":
-            columns |= _inherited(map, columns, heir)
-        for column, target in REFERENCES.get(name, {}).items():
-            columns[column] = new_number[target][columns[column]]
-        if name == "keyframes":  # also where a keyframe without features has no row to name
-            columns["first_feature"] = np.cumsum(columns["n_features"]) - columns["n_features"]
-        table.append(int(keep[name].sum()), **columns)
-    np.maximum(small.points.first_keyframe, 0, out=small.points.first_keyframe)  # born in a root that is gone
+        table.append(int(keep[name].sum()))
+        for column, values in map.tables[name].columns.items():
+            table.columns[column][:] = values[keep[name]]
+    births, first_feature = small.points.first_keyframe, small.keyframes.first_feature
+    births[:] = heir[births]
+    _inherit(map, small.loops, heir)
+    for name, references in REFERENCES.items():
+        for column, target in references.items():
+            rows = small.tables[name].columns[column]
+            rows[:] = new_number[target][rows]
+    births[births < 0] = 0  # in a root that is gone
+    # counted anew, since a keyframe without features may name a row that is gone
+    first_feature[:] = np.cumsum(small.keyframes.n_features) - small.keyframes.n_features
     return small
 
 
@@ -65,13 +68,11 @@ def _numbers(kept: Bools) -> Ints:
     return np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)
 
 
-def _inherited(map: Map, loops: dict[str, AnyArray], heir: Ints) -> dict[str, AnyArray]:
-    """Loops between living keyframes: T_a_b carried over to the heirs of culled ends by their known offsets."""
-    ends = {"a": heir[loops["a"]], "b": heir[loops["b"]], "R": loops["R"].copy(), "p": loops["p"].copy()}
-    for i, (a, b) in enumerate(zip(loops["a"].tolist(), loops["b"].tolist(), strict=True)):
-        new_a, new_b = int(ends["a"][i]), int(ends["b"][i])
+def _inherit(map: Map, loops: Table, heir: Ints) -> None:
+    """Carry the measured T_a_b of culled ends over to their heirs, by the offsets that are believed between them."""
+    for i, (a, b) in enumerate(zip(loops.a.tolist(), loops.b.tolist(), strict=True)):
+        new_a, new_b = int(heir[a]), int(heir[b])
         if (a, b) != (new_a, new_b):
             T_newa_a, T_b_newb = map.pose(new_a).inverse() @ map.pose(a), map.pose(b).inverse() @ map.pose(new_b)
-            T_newa_newb = T_newa_a @ SE3(loops["R"][i], loops["p"][i]) @ T_b_newb
-            ends["R"][i], ends["p"][i] = T_newa_newb.R, T_newa_newb.t
-    return ends
+            T_newa_newb = T_newa_a @ SE3(loops.R[i], loops.p[i]) @ T_b_newb
+            loops.a[i], loops.b[i], loops.R[i], loops.p[i] = new_a, new_b, T_newa_newb.R, T_newa_newb.t
