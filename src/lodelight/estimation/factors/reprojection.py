@@ -7,6 +7,7 @@ The third row is there when the observation carries a depth (RGB-D, stereo), tha
 depth, because the noise of a disparity is Gaussian in 1/z and not in z. Derivation: docs/derivations-reprojection.md.
 """
 
+import math
 from typing import TypeAlias
 
 import numpy as np
@@ -44,10 +45,11 @@ def reprojection(
     y = R_body_cam[0, 1] * ex + R_body_cam[1, 1] * ey + R_body_cam[2, 1] * ez
     z = R_body_cam[0, 2] * ex + R_body_cam[1, 2] * ey + R_body_cam[2, 2] * ez
     u_pred, v_pred, seen = project_jacobian(model, params, x, y, z, E)
-    if not seen or (inv_depth > 0.0 and z < MIN_DEPTH_M):
-        return 0, (0.0, 0.0, 0.0), ZERO, ZERO, ZERO
     s = 1.0 / sigma_px
     ru, rv = (u_pred - u) * s, (v_pred - v) * s
+    # the last is false where a point or a pixel is NaN
+    if not seen or (inv_depth > 0.0 and z < MIN_DEPTH_M) or not ru * ru + rv * rv < math.inf:
+        return 0, (0.0, 0.0, 0.0), ZERO, ZERO, ZERO
     Ju = _row(s * E[0, 0], s * E[0, 1], s * E[0, 2], R, R_body_cam, bx, by, bz)
     Jv = _row(s * E[1, 0], s * E[1, 1], s * E[1, 2], R, R_body_cam, bx, by, bz)
     if inv_depth > 0.0:
