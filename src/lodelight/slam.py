@@ -180,7 +180,7 @@ class Slam:
         with self.map.lock:
             parent = tracked.reference if len(self.map.keyframes) else -1
             keyframe = self.mapper.insert(
-                tracked.t_ns, tracked.T_world_body, tracked.seen, tracked.point, decision.weight, parent
+                tracked.t_ns, tracked.T_world_body, tracked.seen, tracked.point, decision.weight, parent, tracked.noise
             )
             tracked.point[:] = self.map.points_of(keyframe)
         self._last_keyframe_ns = tracked.t_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,8 @@ from lodelight.types import AnyArray, Array, ArrayF32, Ints, Words
 MAX_DEPTH_RATIO = 0.5  # a prediction of where things are is not wrong by half of their depth
 MIN_DEPTH_M = 0.1
 CLOSE_SIGMA = 0.05  # of a depth, as a share of it, up to which a point is put there
+MEDIAN_CHI2_2, MEDIAN_CHI2_3 = 1.386, 2.366  # of a chi-square distribution with 2 and 3 degrees of freedom
+SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it counts as sharp; more is a failure
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
 
 
@@ -40,7 +43,11 @@ class TrackerConfig:
 
 @dataclass(eq=False)
 class Tracked:
-    """A frame and what it was matched with. point : (N,) map point of every feature, -1 = none; inliers only."""
+    """A frame and what it was matched with.
+
+    point : (N,) map point of every feature, -1 = none; inliers only
+    reference : the keyframe that sees most of those points; noise : sigma of its corners over a sharp frame's
+    """
 
     t_ns: int
     seen: Features
@@ -48,6 +55,7 @@ class Tracked:
     covariance: Array
     point: Ints
     reference: int
+    noise: float = 1.0
     why_lost: str = ""
     T_reference_body: SE3 = field(default_factory=SE3.identity)
 
@@ -137,10 +145,10 @@ class Tracker:
         point = point.copy()
         point[match[match >= 0]] = sight.point[new][match >= 0]
         used = np.flatnonzero(point >= 0)
-        solved = self._solve(T_world_body, seen.take(used), map.points.xyz[point[used]])
+        solved, noise = self._solve(T_world_body, seen.take(used), map.points.xyz[point[used]])
         point[used[~solved.inliers]] = -1
         map.points.n_found[point[point >= 0]] += 1
-        tracked = Tracked(t_ns, seen, solved.T_world_body, solved.covariance, point, int(voting[0]))
+        tracked = Tracked(t_ns, seen, solved.T_world_body, solved.covariance, point, int(voting[0]), noise=noise)
         if tracked.n_inliers < self.config.min_inliers:
             tracked.why_lost = f"{tracked.n_inliers} of {len(used)} matches with the local map are inliers"
         return tracked
@@ -207,12 +215,13 @@ class Tracker:
         Around a prediction that is far off, wrong matches are the nearest: they hold a local optimization there.
         """
         feature, xyz = seen.take(pairs[:, 1]), landmarks.xyz[pairs[:, 0]]
-        solved = self._solve(start, feature, xyz)
+        solved, noise = self._solve(start, feature, xyz)
         if solved.n_inliers < MAJORITY * len(pairs):
             drawn = ransac_pnp(feature.ray, xyz, self._sigma_px(feature) / self.camera.focal_px, self.seed)
             if drawn is not None:
-                other = self._solve(drawn[0] @ self.T_body_cam.inverse(), feature, xyz)
-                solved = max(solved, other, key=lambda s: s.n_inliers)
+                other, other_noise = self._solve(drawn[0] @ self.T_body_cam.inverse(), feature, xyz)
+                if other.n_inliers / other_noise > solved.n_inliers / noise:
+                    solved, noise = other, other_noise
         agreed = pairs[solved.inliers]
         point = np.full(len(seen), -1, np.int32)
         point[agreed[:, 1]] = landmarks.point[agreed[:, 0]]
@@ -221,19 +230,30 @@ class Tracker:
     def _convincing(self, fit: Fit) -> bool:
         return fit.solved.n_inliers >= max(self.config.min_matches, MAJORITY * fit.tried)
 
-    def _solve(self, start: SE3, seen: Features, xyz: Array) -> PoseResult:
-        """Motion-only optimization of features against their world positions (N, 3).
+    def _solve(self, start: SE3, seen: Features, xyz: Array) -> tuple[PoseResult, float]:
+        """Motion-only optimization of features against world positions (N, 3), and by how much this frame's noise
+        exceeds a sharp one's.
 
         Pairs of which the start already says that one is much farther than the other are put out of reach first: a
         wrong match close to the camera has a hold on the pose that no robust kernel takes from it.
+        A blurred or quickly turning camera measures worse than its calibration says. Tested against the noise of a
+        sharp frame, the few matches that pass would agree by chance: the frame's own median says what to expect.
         """
         z = ((start @ self.T_body_cam).inverse() @ xyz)[:, 2]
         unlike = (seen.inv_depth > 0) & (np.abs(z * seen.inv_depth - 1.0) > MAX_DEPTH_RATIO)
-        weight = np.where(unlike | (z < MIN_DEPTH_M), 0.0, 1.0)
-        return optimize_pose(
-            start, self.T_body_cam, self.camera, xyz, seen.px, self._sigma_px(seen),
-            seen.inv_depth, seen.sigma_inv_depth, information_weight=weight,
-        )  # fmt: skip
+        possible = ~(unlike | (z < MIN_DEPTH_M))
+        noise = 1.0
+        for _ in range(2):
+            solved = optimize_pose(
+                start, self.T_body_cam, self.camera, xyz, seen.px, noise * self._sigma_px(seen),
+                seen.inv_depth, noise * seen.sigma_inv_depth, information_weight=possible.astype(np.float64),
+            )  # fmt: skip
+            expected = np.where(seen.inv_depth > 0, MEDIAN_CHI2_3, MEDIAN_CHI2_2)
+            excess = np.median((solved.chi2 / expected)[possible]) if possible.any() else 1.0
+            noise = float(np.clip(noise * math.sqrt(excess), 1.0, MAX_NOISE))
+            if noise < SHARP:
+                return solved, 1.0
+        return solved, noise
 
     def _sigma_px(self, seen: Features) -> Array:
         return self.config.sigma_px * self.orb.scale(seen.octave)

@@ -62,10 +62,12 @@ class LocalMapper:
 
     # -- the two halves -----------------------------------------------------------------------------------------
 
-    def insert(self, t_ns: int, T_world_body: SE3, seen: Features, point: Ints, weight: float, parent: int) -> int:
+    def insert(
+        self, t_ns: int, T_world_body: SE3, seen: Features, point: Ints, weight: float, parent: int, noise: float = 1.0
+    ) -> int:
         """A keyframe with its matches (N,) and new points from its depth; returns its id."""
         map = self.map
-        keyframe = map.add_keyframe(t_ns, T_world_body, seen, weight, parent)
+        keyframe = map.add_keyframe(t_ns, T_world_body, seen, weight, parent, noise)
         first = map.feature_range(keyframe).start
         point = map.surviving(point)
         matched = np.flatnonzero(point >= 0)
@@ -244,6 +246,7 @@ def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[
     keyframes = np.unique(np.concatenate([window, observer])).astype(np.int32)
     fixed = ~np.isin(keyframes, window) | (map.keyframes.parent[keyframes] < 0)
     f = map.features
+    noise = map.keyframes.noise[observer]
     problem = BundleProblem(
         camera=map.rig.cameras[0].camera,
         T_body_cam=map.rig.cameras[0].T_body_cam,
@@ -254,9 +257,9 @@ def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[
         keyframe=np.searchsorted(keyframes, observer).astype(np.int32),
         point=np.searchsorted(points, f.point[rows]).astype(np.int32),
         px=f.px[rows].astype(np.float64),
-        sigma_px=sigma_px * orb.scale(f.octave[rows]),
+        sigma_px=sigma_px * noise * orb.scale(f.octave[rows]),
         inv_depth=f.inv_depth[rows].astype(np.float64),
-        sigma_inv_depth=f.sigma_inv_depth[rows].astype(np.float64),
+        sigma_inv_depth=noise * f.sigma_inv_depth[rows],
         weight=map.keyframes.weight[observer],
     )
     return problem, keyframes, points, rows

@@ -25,7 +25,8 @@ class Map:
     """Everything a system knows of a building.
 
     keyframes : t_ns, R (3, 3) and p (3,) m of T_world_body (of T_parent_body once it is culled), weight,
-                parent (spanning tree, -1 = root), first_feature, n_features, alive
+                noise (sigma of its corners over a sharp frame's), parent (spanning tree, -1 = root), first_feature,
+                n_features, alive
     features  : keyframe, px (2,), octave, angle, desc (4,), inv_depth, sigma_inv_depth, point (-1 = none),
                 next (the next feature of the same point, -1 = last)
     points    : xyz (3,) m world, desc (4,), normal (3,) mean viewing direction, d_min, d_max m (where its scale can
@@ -39,7 +40,7 @@ class Map:
         self.rig = rig
         self.lock = threading.RLock()
         self.keyframes = Table(
-            t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), parent=(i32, ()),
+            t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), noise=(f64, ()), parent=(i32, ()),
             first_feature=(i32, ()), n_features=(i32, ()), alive=(np.bool_, ()),
         )  # fmt: skip
         self.features = Table(
@@ -128,7 +129,9 @@ class Map:
 
     # -- how it grows -------------------------------------------------------------------------------------------
 
-    def add_keyframe(self, t_ns: int, T_world_body: SE3, seen: Features, weight: float = 1.0, parent: int = -1) -> int:
+    def add_keyframe(
+        self, t_ns: int, T_world_body: SE3, seen: Features, weight: float = 1.0, parent: int = -1, noise: float = 1.0
+    ) -> int:
         """Append a keyframe with its features, none of them linked to a point yet; returns its id."""
         n, k = len(seen), len(self.keyframes)
         first = self.features.append(
@@ -136,7 +139,7 @@ class Map:
             sigma_inv_depth=seen.sigma_inv_depth, point=-1, next=-1,
         )  # fmt: skip
         return self.keyframes.append(
-            1, t_ns=t_ns, R=T_world_body.R, p=T_world_body.t, weight=weight, parent=parent,
+            1, t_ns=t_ns, R=T_world_body.R, p=T_world_body.t, weight=weight, noise=noise, parent=parent,
             first_feature=first, n_features=n, alive=True,
         )  # fmt: skip
 
