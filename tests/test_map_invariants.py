@@ -7,7 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from lodelight.features.orb import OrbConfig
 from lodelight.mapping import invariants
+from lodelight.mapping.local import LocalMapper, LocalMappingConfig, fuse_into
 from lodelight.mapping.map import Map
 from maps import large_map, room_map, thinned
 
@@ -114,3 +116,33 @@ def test_longer_circles_of_parents_are_found() -> None:
     assert broken(set_column("keyframes", "parent", 2, 9)) == [
         "keyframes that are their own ancestors: 2, 3, 4, 5, 6, ... (10 in all)"
     ]
+
+
+# -- what mapping does to a map keeps it sound ----------------------------------------------------------------------
+
+
+def test_a_keyframe_whose_matches_were_fused_since_sees_each_point_once() -> None:
+    map, mapper = mapper_of(room_map())
+    seen, point = map.features_of(3), map.points_of(3).copy()
+    map.fuse_points(int(point[0]), int(point[1]))
+    mapper.insert(10**12, map.pose(3), seen, point, weight=1.0, parent=11)
+    assert invariants.problems(map) == []
+
+
+def test_fusing_neighbours_points_into_a_keyframe_keeps_the_map_sound() -> None:
+    """The points of a second map of the same room, laid over the first with errors of some pixels."""
+    map, mapper = mapper_of(room_map(n_points=600))
+    other = room_map(n_points=600, sigma_px=1.0)
+    rng = np.random.default_rng(0)
+    for k in range(0, 12, 2):
+        points = other.points_of(k).copy()
+        mapper.insert(10**12 + k, other.pose(k), other.features_of(k), np.full(len(points), -1, np.int32), 1.0, 11)
+    n_before = len(map.alive_points)
+    for keyframe in rng.permutation(len(map.keyframes)):
+        fuse_into(map, int(keyframe), map.alive_points, mapper.orb, radius_px=6.0)
+    assert len(map.alive_points) < n_before  # something was fused
+    assert invariants.problems(map) == []
+
+
+def mapper_of(map: Map) -> tuple[Map, LocalMapper]:
+    return map, LocalMapper(map, OrbConfig(), LocalMappingConfig())

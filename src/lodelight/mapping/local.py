@@ -38,7 +38,7 @@ class LocalMappingConfig:
     found_ratio : a point found in a smaller share of the frames that should see it is culled
     """
 
-    sigma_px: float = 0.8
+    sigma_px: float = 1.0
     close_sigma: float = 0.05
     min_close: int = 100
     neighbours: int = 8
@@ -46,7 +46,7 @@ class LocalMappingConfig:
     min_shared: int = 15
     redundant: float = 0.9
     found_ratio: float = 0.25
-    iterations: int = 5
+    iterations: int = 10
 
 
 class LocalMapper:
@@ -71,6 +71,8 @@ class LocalMapper:
         first = map.feature_range(keyframe).start
         point = map.surviving(point)
         matched = np.flatnonzero(point >= 0)
+        _, once = np.unique(point[matched], return_index=True)  # two of them may have been fused since
+        matched = matched[np.sort(once)]
         map.link(first + matched, point[matched])
         map.refresh_points(point[matched], self.orb.scale_factor, self.orb.n_levels)
         fresh = np.flatnonzero((point < 0) & self.close(seen))
