@@ -1,0 +1,1 @@
+"""The buildings, one file each; `sim.scenarios` names them."""
