@@ -13,7 +13,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.localization.machine import Found
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
-from lodelight.mapping.verification import Location, Verifier
+from lodelight.mapping.verification import Location, Refusal, Verifier
 from lodelight.types import Ints
 
 
@@ -55,8 +55,8 @@ class Relocalizer:
             doubts = []
             for keyframe in candidates.tolist():
                 found = self._verifier.locate(seen, keyframe, self._verifier.neighbourhood(keyframe))
-                doubt = found if isinstance(found, str) else self._doubt(found)
-                if not isinstance(found, str) and not doubt:
+                doubt = found.why if isinstance(found, Refusal) else self._doubt(found)
+                if isinstance(found, Location) and not doubt:
                     return self._answer(seen, keyframe, found)
                 doubts.append(f"most like keyframe {keyframe}, but {doubt}")
             return doubts[0] if doubts else "no keyframe looks alike"

@@ -52,6 +52,14 @@ class Location:
         return len(self.point)
 
 
+@dataclass(frozen=True)
+class Refusal:
+    """Why an image is not believed to show a place. inliers : points or matches that agreed on a pose, at best"""
+
+    why: str
+    inliers: int = 0
+
+
 class Verifier:
     """Locates images in parts of a map.
 
@@ -72,7 +80,7 @@ class Verifier:
             around = around[~np.isin(around, excluded)]
         return np.append(np.int32(keyframe), around[:size])
 
-    def locate(self, seen: Features, keyframe: int, neighbourhood: Ints) -> Location | str:
+    def locate(self, seen: Features, keyframe: int, neighbourhood: Ints) -> Location | Refusal:
         """Where `seen` was taken if it shows what `keyframe` shows, or why it is not believed to.
 
         neighbourhood : keyframes whose points are looked for
@@ -80,7 +88,7 @@ class Verifier:
         sets those bounds. Source: science note B2.
         """
         pose = self._draw(seen, keyframe)
-        if isinstance(pose, str):
+        if isinstance(pose, Refusal):
             return pose
         points = points_of_keyframes(self.map, neighbourhood)
         index = FeatureIndex(seen, self.camera.width, self.camera.height)
@@ -96,7 +104,8 @@ class Verifier:
             feature, point = match[hit], sight.point[hit]
             solved = self._solve(pose, seen.take(feature), point)
             if solved.n_inliers < MIN_AGREEING:
-                return f"{solved.n_inliers} of {len(sight.point)} points are where they should be"
+                why = f"{solved.n_inliers} of {len(sight.point)} points are where they should be"
+                return Refusal(why, solved.n_inliers)
             pose = solved.T_world_body
         feature, point = feature[solved.inliers], point[solved.inliers]
         expected, shown = self._cells(sight.px), self._cells(seen.px[feature])
@@ -116,7 +125,7 @@ class Verifier:
         near = off_px < window_px * self.orb.scale(seen.octave[located.feature]) + np.minimum(2.0 * blur_px, window_px)
         return float(np.mean(near & visible))
 
-    def _draw(self, seen: Features, keyframe: int) -> SE3 | str:
+    def _draw(self, seen: Features, keyframe: int) -> SE3 | Refusal:
         """A first pose, from matches of descriptors with those of one keyframe."""
         there, point = self.map.features_of(keyframe), self.map.points_of(keyframe)
         there, point = there.take(point >= 0), point[point >= 0]
@@ -124,13 +133,13 @@ class Verifier:
         hit = np.flatnonzero(match >= 0)
         hit = hit[consistent_turn(there.angle[hit], seen.angle[match[hit]])] if len(hit) else hit
         if len(hit) < MIN_AGREEING:
-            return f"{len(hit)} descriptors match, {MIN_AGREEING} are needed"
+            return Refusal(f"{len(hit)} descriptors match, {MIN_AGREEING} are needed")
         seen, point = seen.take(match[hit]), point[hit]
         sigma_rad = np.hypot(self._sigma_px(seen) / self.camera.focal_px, PARALLAX * self._depth_sigma(point))
         found = ransac_pnp(seen.ray, self.map.points.xyz[point], sigma_rad, seed=0)
         agreeing = 0 if found is None else int(found[1].sum())
         if found is None or agreeing < MIN_AGREEING:
-            return f"{agreeing} of {len(hit)} matches fit one pose, {MIN_AGREEING} are needed"
+            return Refusal(f"{agreeing} of {len(hit)} matches fit one pose, {MIN_AGREEING} are needed", agreeing)
         T_world_cam, inliers = found
         start = T_world_cam @ self.T_body_cam.inverse()
         return self._solve(start, seen.take(inliers), point[inliers]).T_world_body
