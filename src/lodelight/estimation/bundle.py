@@ -15,7 +15,7 @@ from lodelight.compiled import kernel
 from lodelight.estimation import bundle_kernels
 from lodelight.estimation.block_cholesky import BlockPlan
 from lodelight.estimation.factors.pose_prior import PosePrior, add_pose_prior
-from lodelight.estimation.factors.reprojection import inliers_of
+from lodelight.estimation.factors.reprojection import TESTED_PX, TESTED_PX_DEPTH, inliers_of
 from lodelight.estimation.pose import BROAD_SIGMA_M, BROAD_SIGMA_RAD
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
@@ -87,12 +87,12 @@ def bundle_adjust(
     polish : then so many without kernel on the inliers alone (the two stages of local adjustment: 5 and 10)
     stop : asked between iterations; the best state so far is returned
     covariance_of : keyframes whose marginal covariance is wanted, with all points uncertain; it counts what the last
-        stage counted, and after a robust one the inliers
+        stage counted, or after a robust one the inliers, less what their test costs (see `factors.reprojection`)
     """
     adjustment = _Adjustment(problem)
     adjustment.run(iterations, robust, stop)
     if robust or polish:
-        adjustment.active = adjustment.inliers
+        adjustment.drop_outliers()
     if polish:
         adjustment.run(polish, False, stop)
     return adjustment.result(covariance_of)
@@ -155,11 +155,15 @@ class _Adjustment:
         )  # fmt: skip
         self.V_inverse = np.empty((m, 6))
         self.S, self.b = np.empty((self.plan.n_blocks, 6, 6)), np.empty((len(free), 6))
-        self.active = np.ones(n, bool)
+        self.active, self.worth = np.ones(n, bool), np.ones(n)
 
     @property
     def inliers(self) -> Bools:
         return inliers_of(self.linear.chi2, self.inv_depth)
+
+    def drop_outliers(self) -> None:
+        self.active = self.inliers
+        self.worth = np.where(self.inv_depth > 0.0, TESTED_PX_DEPTH, TESTED_PX)
 
     def run(self, iterations: int, robust: bool, stop: Callable[[], bool] | None) -> None:
         self._linearize(self.state, self.linear, robust, self.linear.chi2)
@@ -238,6 +242,7 @@ class _Adjustment:
         wanted = np.flatnonzero(self.position[keyframes] >= 0)
         if len(wanted) == 0:
             return out
+        self.weight = self.weight * self.worth
         self._linearize(self.state, self.linear, False, self.linear.chi2)
         broad = 1.0 / np.repeat([BROAD_SIGMA_RAD**2, BROAD_SIGMA_M**2], 3)
         self.linear.U[:, range(6), range(6)] += broad

@@ -15,8 +15,8 @@ import numpy as np
 from lodelight.compiled import kernel
 from lodelight.estimation.factors.reprojection import CHI2_PX, CHI2_PX_DEPTH, reprojection
 from lodelight.estimation.robust import huber
-from lodelight.geometry.dense import inverse3, matmul
-from lodelight.geometry.so3 import so3_exp
+from lodelight.geometry.dense import inverse3
+from lodelight.geometry.so3 import so3_perturbed
 from lodelight.types import Array, Bools, Ints
 
 # Added to the diagonal of every pose: one that nothing measures stays where it is.
@@ -155,7 +155,7 @@ def step(
         i = position[k]
         turned = R[k]
         if i >= 0:
-            turned = matmul(R[k], so3_exp(d_pose[i, :3]))
+            turned = so3_perturbed(R[k], d_pose[i, :3])
             for a in range(6):
                 gain -= g_pose[k, a] * d_pose[i, a]
         for a in range(3):

@@ -9,12 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from lodelight.compiled import kernel
 from lodelight.estimation.factors.pose_prior import add_pose_prior
-from lodelight.estimation.factors.reprojection import CHI2_PX, CHI2_PX_DEPTH, inliers_of, reprojection
+from lodelight.estimation.factors.reprojection import (
+    CHI2_PX,
+    CHI2_PX_DEPTH,
+    TESTED_PX,
+    TESTED_PX_DEPTH,
+    inliers_of,
+    reprojection,
+)
 from lodelight.estimation.robust import huber
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.dense import cholesky, cholesky_solve, matmul, spd_inverse
@@ -34,7 +42,8 @@ BROAD_SIGMA_M = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class PoseResult:
-    """covariance : (6, 6), chart of SE3.perturbed, (J^T J)^-1 of the inliers times max(1, chi2 / dof)
+    """covariance : (6, 6), chart of SE3.perturbed; inverse information of the inliers, less what their test costs
+        (see `factors.reprojection`), times max(1, chi2 / dof)
     inliers : (N,) inside the 95 % bound; chi2 : (N,) unweighted, inf where the camera cannot see the point
     """
 
@@ -71,11 +80,11 @@ def optimize_pose(
     """
     n = len(xyz)
     mean, information = prior if prior is not None else (T_world_body, np.zeros((6, 6)))
+    weight = np.ones(n) if information_weight is None else _f64(information_weight)
     R, p, chi2, inliers, covariance = _optimize(
-        camera.model, camera.params, _f64(T_world_body.R), _f64(T_world_body.t), _f64(T_body_cam.R), _f64(T_body_cam.t),
-        _f64(xyz), _f64(px), _f64(sigma_px), _f64(inv_depth), _f64(sigma_inv_depth),
-        np.ones(n) if information_weight is None else _f64(information_weight),
-        _f64(mean.R), _f64(mean.t), _f64(information), prior is not None,
+        (camera.model, camera.params, _f64(T_body_cam.R), _f64(T_body_cam.t)),
+        (_f64(xyz), _f64(px), _f64(sigma_px), _f64(inv_depth), _f64(sigma_inv_depth)), weight,
+        (_f64(mean.R), _f64(mean.t), _f64(information)), prior is not None, _f64(T_world_body.R), _f64(T_world_body.t),
     )  # fmt: skip
     # Back onto SO(3): a motion model that inverts by transposing would more than double what rounding left, each frame.
     R = matrix_from_quat_wxyz(quat_wxyz_from_matrix(R))
@@ -86,10 +95,14 @@ def _f64(a: AnyArray) -> Array:
     return np.ascontiguousarray(a, dtype=np.float64)
 
 
+Lens: TypeAlias = tuple[int, Array, Array, Array]  # model, params, R_body_cam, p_body_cam
+Views: TypeAlias = tuple[Array, Array, Array, Array, Array]  # xyz, px, sigma_px, inv_depth, sigma_inv_depth
+Prior: TypeAlias = tuple[Array, Array, Array]  # R, p, information
+
+
 @kernel
 def _linearize(
-    model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array, xyz: Array, px: Array,
-    sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, weight: Array, active: Bools, robust: bool,
+    lens: Lens, views: Views, weight: Array, active: Bools, robust: bool, R: Array, p: Array,
     before: Array, chi2: Array, H: Array, g: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Fill chi2 (N,), H (6, 6) lower half and g (6,); returns the cost, and the cost comparable with `before`.
@@ -97,6 +110,8 @@ def _linearize(
     Comparable: over the observations seen in `before`; one that left the view keeps the cost it had there, so a
     step is neither rewarded for losing points nor stopped by one.
     """
+    model, params, R_body_cam, p_body_cam = lens
+    xyz, px, sigma_px, inv_depth, sigma_inv_depth = views
     E = np.zeros((2, 3))
     H[:] = 0.0
     g[:] = 0.0
@@ -134,66 +149,73 @@ def _linearize(
 
 @kernel
 def _optimize(
-    model: int, params: Array, R: Array, p: Array, R_body_cam: Array, p_body_cam: Array, xyz: Array, px: Array,
-    sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, weight: Array,
-    R_prior: Array, p_prior: Array, prior_information: Array, has_prior: bool,
+    lens: Lens, views: Views, weight: Array, prior: Prior, has_prior: bool, R: Array, p: Array
 ) -> tuple[Array, Array, Array, Bools, Array]:  # fmt: skip
     """From R and p to the optimum: R, p, chi2 (N,), inliers (N,), covariance (6, 6)."""
-    n = xyz.shape[0]
+    n = len(weight)
     chi2, trial_chi2 = np.full(n, math.inf), np.empty(n)
     H, g, trial_H, trial_g = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty(6)
-    active, settled = np.ones(n, np.bool_), False
-    for round_ in range(ROUNDS + 1):
-        robust = round_ < ROBUST_ROUNDS
-        cost, _ = _linearize(
-            model, params, R, p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth, sigma_inv_depth,
-            weight, active, robust, chi2, chi2, H, g,
-        )  # fmt: skip
+    active = np.ones(n, np.bool_)
+    for round_ in range(ROUNDS):
+        robust, damping = round_ < ROBUST_ROUNDS, 1e-9
+        cost, _ = _linearize(lens, views, weight, active, robust, R, p, chi2, chi2, H, g)
         if has_prior:
-            cost += add_pose_prior(R, p, R_prior, p_prior, prior_information, H, g)
-        if settled or round_ == ROUNDS:  # H and cost now belong to the inliers at the result
-            break
-        damping = 1e-9
+            cost += add_pose_prior(R, p, prior[0], prior[1], prior[2], H, g)
         for _ in range(ITERATIONS):
             L, step = H.copy(), -g
             for a in range(6):
                 L[a, a] += damping * H[a, a] + 1e-12
-            gain = 0.0
             if cholesky(L):
                 cholesky_solve(L, step)
+                gain = 0.0
                 for a in range(6):
                     gain -= g[a] * step[a]
                 if gain < CONVERGED_CHI2:
                     break
                 trial_R, trial_p = matmul(R, so3_exp(step[:3])), p + step[3:]
                 trial_cost, comparable = _linearize(
-                    model, params, trial_R, trial_p, R_body_cam, p_body_cam, xyz, px, sigma_px, inv_depth,
-                    sigma_inv_depth, weight, active, robust, chi2, trial_chi2, trial_H, trial_g,
-                )  # fmt: skip
+                    lens, views, weight, active, robust, trial_R, trial_p, chi2, trial_chi2, trial_H, trial_g
+                )
                 if has_prior:
-                    extra = add_pose_prior(trial_R, trial_p, R_prior, p_prior, prior_information, trial_H, trial_g)
+                    extra = add_pose_prior(trial_R, trial_p, prior[0], prior[1], prior[2], trial_H, trial_g)
                     trial_cost, comparable = trial_cost + extra, comparable + extra
                 if comparable <= cost:
                     R, p, cost, damping = trial_R, trial_p, trial_cost, max(0.1 * damping, 1e-9)
                     H, trial_H, g, trial_g, chi2, trial_chi2 = trial_H, H, trial_g, g, trial_chi2, chi2
                     continue
             damping = max(100.0 * damping, 1e-6)
-        inliers = inliers_of(chi2, inv_depth)
+        inliers = inliers_of(chi2, views[3])
         settled = not robust
         for i in range(n):
             settled = settled and inliers[i] == active[i]
         active = inliers
-    return R, p, chi2, active, _covariance(H, cost, active, inv_depth, has_prior)
+        if settled:
+            break
+    widen = _tested(views[3], active, chi2, weight, has_prior, trial_chi2)
+    _linearize(lens, views, trial_chi2, active, False, R, p, chi2, chi2, H, g)
+    if has_prior:
+        add_pose_prior(R, p, prior[0], prior[1], prior[2], H, g)
+    return R, p, chi2, active, _covariance(H, widen)
 
 
 @kernel
-def _covariance(H: Array, cost: float, inliers: Bools, inv_depth: Array, has_prior: bool) -> Array:
-    """Inverse information, widened where the residuals are larger than their sigmas say."""
-    dof = 0 if has_prior else -6
-    for i in range(len(inliers)):
+def _tested(inv_depth: Array, inliers: Bools, chi2: Array, weight: Array, has_prior: bool, worth: Array) -> float:
+    """Fill worth (N,), the weight that is left of each observation after its test; returns max(1, chi2 / dof)."""
+    rows, total, expected = 0, 0.0, 0.0
+    for i in range(len(weight)):
+        k, share = (3, TESTED_PX_DEPTH) if inv_depth[i] > 0.0 else (2, TESTED_PX)
+        worth[i] = share * weight[i]
         if inliers[i]:
-            dof += 3 if inv_depth[i] > 0.0 else 2
-    widen = max(1.0, cost / dof) if dof > 0 else 1.0
+            rows += k
+            total += chi2[i]
+            expected += share * k
+    dof = rows if has_prior else rows - 6
+    return max(1.0, total / expected * rows / dof) if dof > 0 else 1.0
+
+
+@kernel
+def _covariance(H: Array, widen: float) -> Array:
+    """Inverse information, finite where it is singular."""
     information = H / widen
     for a in range(6):
         information[a, a] += 1.0 / (BROAD_SIGMA_RAD**2 if a < 3 else BROAD_SIGMA_M**2)

@@ -18,7 +18,7 @@ from lodelight.estimation.factors.pose_prior import PosePrior, add_pose_prior
 from lodelight.estimation.factors.relative_pose import relative_pose
 from lodelight.estimation.robust import dynamic_covariance, huber
 from lodelight.geometry.dense import matmul, transposed
-from lodelight.geometry.so3 import so3_exp
+from lodelight.geometry.so3 import so3_perturbed
 from lodelight.types import AnyArray, Array, Bools, Ints
 
 Robust: TypeAlias = Literal["none", "huber", "dcs"]
@@ -221,7 +221,7 @@ def _moved(R: Array, p: Array, position: Ints, step: Array, gravity_aligned: boo
         for a in range(3):
             w[a] = R[k, 2, a] * step[i, 2] if gravity_aligned else step[i, a]
             new_p[k, a] += step[i, 3 + a]
-        turned = matmul(R[k], so3_exp(w))
+        turned = so3_perturbed(R[k], w)
         for a in range(3):
             for b in range(3):
                 new_R[k, a, b] = turned[a, b]

@@ -11,9 +11,9 @@ import math
 import numpy as np
 
 from lodelight.compiled import kernel
-from lodelight.geometry.dense import cholesky, cholesky_solve, matmul
+from lodelight.geometry.dense import cholesky, cholesky_solve
 from lodelight.geometry.p3p import p3p, triangle_pose
-from lodelight.geometry.so3 import so3_exp
+from lodelight.geometry.so3 import so3_perturbed
 from lodelight.types import AnyArray, Array, Words
 
 RAYS, POINTS = 0, 1  # what the camera has of a world point: its direction, or its position
@@ -176,5 +176,5 @@ def _refine(kind: int, R: Array, c: Array, seen: Array, xyz: Array, sigma: Array
         if not cholesky(H):
             break
         cholesky_solve(H, g)
-        R, c = matmul(R, so3_exp(g[:3])), c + g[3:]
+        R, c = so3_perturbed(R, g[:3]), c + g[3:]
     return R, c

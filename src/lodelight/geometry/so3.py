@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from lodelight.compiled import kernel
+from lodelight.geometry.dense import matmul
 from lodelight.types import Array
 
 
@@ -104,6 +105,12 @@ def so3_log(R: Array) -> Array:
     s = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     scale = 2.0 / q[0] if s < 1e-10 else 2.0 * math.atan2(s, q[0]) / s
     return np.array([scale * q[1], scale * q[2], scale * q[3]])
+
+
+@kernel
+def so3_perturbed(R: Array, w: Array) -> Array:
+    """R Exp(w), put back onto SO(3): rounding does not add up over the steps of an estimator."""
+    return matrix_from_quat_wxyz(quat_wxyz_from_matrix(matmul(R, so3_exp(w))))
 
 
 @kernel
