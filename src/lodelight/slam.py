@@ -207,6 +207,7 @@ class Slam:
             close_tracked=int(np.count_nonzero(close & (tracked.point >= 0))),
             close_untracked=int(np.count_nonzero(close & (tracked.point < 0))),
             n_keyframes=n_keyframes,
+            noise=tracked.noise,
             since_keyframe_s=(tracked.t_ns - self._last_keyframe_ns) * 1e-9,
             since_relocalization_s=(tracked.t_ns - self._relocalized_ns) * 1e-9,
             mapping_idle=self.mapping.idle,

@@ -34,7 +34,7 @@ class TrackerConfig:
     min_inliers : fewer after the local map, and the frame is lost; good_inliers : fewer, and it is degraded
     """
 
-    sigma_px: float = 0.8
+    sigma_px: float = 1.0
     search_px: float = 15.0
     min_matches: int = 20
     min_inliers: int = 15

@@ -17,6 +17,7 @@ class KeyframeConfig:
     overlap : the share of the reference keyframe's points above which a frame adds nothing new
     weak_overlap : the share below which one is inserted whatever the timing (if weak_tracking_override)
     min_points : with fewer tracked points a frame is not trusted to become one
+    max_noise : a frame whose corners are noisier than a sharp one's by more waits for a sharper one, if it can
     close_low, close_new : few close points tracked, and so many that could be made
     queue_limit : keyframes that may wait for mapping
     map_limit : keyframes above which none is inserted within max_interval_s of a relocalization
@@ -29,6 +30,7 @@ class KeyframeConfig:
     weak_overlap: float = 0.25
     weak_tracking_override: bool = True
     min_points: int = 15
+    max_noise: float = 1.5
     close_low: int = 100
     close_new: int = 70
     queue_limit: int = 3
@@ -40,6 +42,7 @@ class Candidate:
     """What is known of a frame when it is asked whether it becomes a keyframe.
 
     reference_points : of the reference keyframe, those seen often enough to be expected again
+    noise : sigma of this frame's corners over a sharp frame's
     close_tracked, close_untracked : features with good depth, with and without a map point
     """
 
@@ -49,6 +52,7 @@ class Candidate:
     close_tracked: int
     close_untracked: int
     n_keyframes: int
+    noise: float
     since_keyframe_s: float
     since_relocalization_s: float
     mapping_idle: bool = True
@@ -97,6 +101,12 @@ def too_few_points(c: Candidate, config: KeyframeConfig) -> str:
     return ""
 
 
+def blurred(c: Candidate, config: KeyframeConfig) -> str:
+    if c.noise > config.max_noise and c.since_keyframe_s < config.max_interval_s and not is_weak(c, config):
+        return f"its corners are {c.noise:.1f} times as noisy as a sharp frame's, and tracking can wait"
+    return ""
+
+
 def overlap_too_high(c: Candidate, config: KeyframeConfig) -> str:
     limit = config.overlap_young if c.n_keyframes < 2 else config.overlap
     if c.inliers >= limit * c.reference_points and not needs_close_points(c, config):
@@ -123,7 +133,7 @@ def too_early(c: Candidate, config: KeyframeConfig) -> str:
 
 def decide(c: Candidate, config: KeyframeConfig, gates: tuple[Gate, ...] = ()) -> Decision:
     """Whether to insert, why, and the weight the gates give: the least of theirs."""
-    for refuses in (forbidden, too_few_points, overlap_too_high, too_early):
+    for refuses in (forbidden, too_few_points, blurred, overlap_too_high, too_early):
         why = refuses(c, config)
         if why:
             return Decision(False, why)
