@@ -370,6 +370,25 @@ def test_a_map_that_would_lead_out_of_its_arrays_is_neither_saved_nor_loaded(
     assert check_map(saved) == ["points whose head is no row of features: 3"]
 
 
+# -- the documentation --------------------------------------------------------------------------------------------
+
+
+def test_the_page_on_the_file_reads_a_keyframe_without_this_package(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "map-file.md").read_text(encoding="utf-8")
+    codes = [block.split("```")[0] for block in page.split("```python\n")[1:]]
+    (saved.parent / "out").mkdir()
+    saved.rename(saved.parent / "out" / "map.lode")
+    monkeypatch.chdir(saved.parent)
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for code in codes:
+        exec(code, found)
+    original = room_map(sigma_px=0.5)
+    for name, values in original.features.columns.items():
+        np.testing.assert_array_equal(found["features"][name], values[original.feature_range(0)])
+
+
 # -- columns come and go ----------------------------------------------------------------------------------------
 
 

@@ -16,7 +16,8 @@ from lodelight.mapping.map import Map
 from lodelight.mapping.upright import estimate_up
 from lodelight.types import Array
 
-LEVEL_DEG = 3.0  # nearer to the map's own z than an estimate of up errs, z it is
+LEVEL_DEG = 5.0  # what an estimate of up from a surface errs: nearer to the map's own z, z it is
+PITCH_DEG = 45.0  # what the mean of the cameras' own up may be off, all of them looking down at a table
 
 
 def export_cloud(map: Map, out: Path, format: str) -> dict[str, Any]:
@@ -65,18 +66,19 @@ def export_grid(map: Map, out: Path, up: Array | None = None, **options: Any) ->
 
 
 def map_up(map: Map) -> tuple[Array, str]:
-    """Unit vector up (3,) in the map's frame, and how it is known."""
+    """Unit vector up (3,) in the map's frame, and how it is known: the map's z wherever the cameras do not belie it."""
     z = np.array([0.0, 0.0, 1.0])
-    keyframes, spec = map.alive_keyframes, map.rig.cameras[0]
-    if map.rig.imu is not None:
-        return z, "the map's z, levelled by the IMU"
-    if not len(keyframes):
-        return z, "the map's z, for want of keyframes"
-    poses = [map.pose(int(k)) @ spec.T_body_cam for k in keyframes]
+    spec = map.rig.cameras[0]
+    poses = [map.pose(int(k)) @ spec.T_body_cam for k in map.alive_keyframes]
+    if not poses:
+        return z, "its z, for want of keyframes"
     R_world_cam, centres = np.array([T.R for T in poses]), np.array([T.t for T in poses])
     up, share = estimate_up(map.points.xyz[map.points.alive], R_world_cam, centres)
-    if share == 0.0:
+    off_deg = float(np.degrees(np.arccos(np.clip(up @ z, -1.0, 1.0))))
+    if share > 0.0 and off_deg > LEVEL_DEG:
+        return up, f"the normal of the largest surface seen from above, which holds {100 * share:.0f} % of the points"
+    if share > 0.0:
+        return z, f"its z, {off_deg:.1f} degrees from the normal of the largest surface seen from above"
+    if off_deg > PITCH_DEG:
         return up, "the cameras' own on the average, for want of a floor or a table; better give it"
-    if up @ z > np.cos(np.radians(LEVEL_DEG)):
-        return z, f"the map's z, within {LEVEL_DEG:g} degrees of the normal of the largest surface seen from above"
-    return up, f"the normal of the largest surface seen from above, which holds {100 * share:.0f} % of the points"
+    return z, f"its z, {off_deg:.0f} degrees from the cameras' own on the average, for want of a floor or a table"

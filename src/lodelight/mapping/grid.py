@@ -2,7 +2,7 @@
 
 Every sighting is a ray from a camera to a point. Space is counted in boxes as wide as a cell and 0.2 m high: a box
 is hit where rays end and missed where they pass. A cell is occupied where one of its boxes is, free where none is and
-at least one was looked through, and else unknown: blank walls carry no points and stay unknown.
+at least one was looked through (by four rays, if none ended there), and else unknown: so do blank walls stay.
 Source: Moravec and Elfes 1985; hit and miss probabilities of OctoMap, Hornung et al. 2013.
 """
 
@@ -20,6 +20,7 @@ from lodelight.types import AnyArray, Array, Ints
 
 BOX_HEIGHT_M = 0.2
 LOG_ODDS_HIT, LOG_ODDS_MISS = math.log(0.7 / 0.3), math.log(0.4 / 0.6)
+LOG_ODDS_OCCUPIED, LOG_ODDS_FREE = math.log(0.65 / 0.35), math.log(0.196 / 0.804)  # map_server's own thresholds
 CLEARANCE_CELLS = 2.0  # a ray stops short of its point by this: points err, and a slant ray grazes its own wall
 MAX_BOXES = 50_000_000  # 400 MB of counts
 
@@ -104,8 +105,8 @@ def occupancy_grid(
     _count(centres - corner, points - corner, size_m, range_m, hits, misses)
     log_odds = hits * LOG_ODDS_HIT + misses * LOG_ODDS_MISS
     cells = np.full((rows, columns), UNKNOWN, np.int8)
-    cells[(misses > 0).any(axis=0)] = FREE
-    cells[(log_odds > 0.0).any(axis=0)] = OCCUPIED
+    cells[(log_odds < LOG_ODDS_FREE).any(axis=0)] = FREE
+    cells[(log_odds > LOG_ODDS_OCCUPIED).any(axis=0)] = OCCUPIED
     return Grid(cells, resolution_m, (float(corner[0]), float(corner[1])), floor_m, R_grid_map)
 
 
