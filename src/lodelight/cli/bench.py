@@ -32,37 +32,48 @@ COLUMNS = (
 )
 
 
-@app.command(epilog="Example: lodelight bench recordings/room recordings/hall --runs 5")
+@app.command(epilog="Example: lodelight bench recordings/room recordings/hall --sim office --runs 5")
 def bench(
-    recordings: list[Path] = typer.Argument(..., help="Recordings to run over."),
+    recordings: list[Path] = typer.Argument(None, help="Recordings to run over; none, nor --sim: all simulated ones."),
+    simulated: list[str] = typer.Option([], "--sim", help="Also over this simulated building; may be repeated."),
+    duration: float = typer.Option(20.0, min=1.0, help="Length of a simulated recording, s."),
     runs: int = typer.Option(3, min=1, help="Runs of each, every one in a process of its own."),
+    sensors: str = typer.Option("", help="Handed on to `lodelight run`."),
     settings: list[str] = typer.Option([], "--set", help="Handed on to `lodelight run`."),
     as_json: bool = typer.Option(False, "--json", help="Print every figure of every run."),
 ) -> None:
     """Time and error over recordings on this machine: medians and ranges."""
     from lodelight.cli.progress import track
+    from lodelight.sim.scenarios import SCENARIOS
 
+    options = [word for setting in settings for word in ("--set", setting)] + (
+        ["--sensors", sensors] if sensors else []
+    )
     with tempfile.TemporaryDirectory() as scratch:
-        asked = [(recording, Path(scratch) / "out") for recording in recordings for _ in range(runs)]
-        done = [(str(rec), _run(rec, out, settings)) for rec, out in track(asked, "runs", len(asked))]
-    results = {str(rec): [metrics for name, metrics in done if name == str(rec)] for rec in recordings}
+        sources = {str(recording): recording for recording in recordings or []}
+        buildings = simulated or ([] if sources else list(SCENARIOS))
+        for name in track(buildings, "rendering", len(buildings)):
+            sources[f"sim {name}"] = Path(scratch) / name
+            _lodelight("sim", name, "--out", str(sources[f"sim {name}"]), "--duration", str(duration))
+        asked = [(label, source) for label, source in sources.items() for _ in range(runs)]
+        results: dict[str, list[dict[str, Any]]] = {label: [] for label in sources}
+        for label, source in track(asked, "runs", len(asked)):
+            printed = _lodelight("run", str(source), "--out", str(Path(scratch) / "out"), "--json", *options)
+            results[label].append(json.loads(printed))
     machine = _machine()
     print(json.dumps({"machine": machine, "runs": results}, indent=2) if as_json else _page(machine, results, runs))
 
 
-def _run(recording: Path, out: Path, settings: list[str]) -> dict[str, Any]:
-    """metrics.json of one run; a recording that was lost throughout has one too."""
+def _lodelight(*arguments: str) -> str:
+    """What a command prints, run in a process of its own; a run that was lost throughout (status 1) prints too."""
     from lodelight.errors import SourceError
 
-    chosen = [word for setting in settings for word in ("--set", setting)]
-    command = [sys.executable, "-m", "lodelight", "run", str(recording), "--out", str(out), "--json", *chosen]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "lodelight", *arguments], capture_output=True, text=True)
     if done.returncode == 2:
-        raise SourceError(done.stderr.strip().removeprefix("lodelight: ").removeprefix("SourceError: "))
-    if not done.stdout:  # a bug, whose traceback is worth more than a line
-        raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}\n{done.stderr}")
-    metrics: dict[str, Any] = json.loads(done.stdout)
-    return metrics
+        raise SourceError(done.stderr.strip().removeprefix("lodelight: ").partition("Error: ")[2] or done.stderr)
+    if done.returncode not in (0, 1) or not done.stdout:  # a bug, whose traceback is worth more than a line
+        raise RuntimeError(f"lodelight {' '.join(arguments)} ended with {done.returncode}\n{done.stderr}")
+    return done.stdout
 
 
 def _machine() -> dict[str, Any]:
