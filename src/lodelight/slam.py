@@ -20,8 +20,10 @@ from lodelight.localization.machine import LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
 from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
-from lodelight.mapping.local import LocalMapper, LocalMappingConfig
+from lodelight.mapping.local import LocalMapper, LocalMappingConfig, adjust
+from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map
+from lodelight.mapping.places import Places
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
 from lodelight.messages import Estimate, Frame, Message
 from lodelight.rig import Rig
@@ -35,15 +37,21 @@ LOST_COVARIANCE = np.diag([math.pi**2] * 3 + [1e6] * 3)
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """Every default of the system, by stage. min_start_points : close points below which no map is begun."""
+    """Every default of the system, by stage.
+
+    min_start_points : close points below which no map is begun
+    final_iterations : of the adjustment of the whole map at the end of a run
+    """
 
     sensors: str = "rgbd"
     seed: int = 0
     min_start_points: int = 50
+    final_iterations: int = 10
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackerConfig = field(default_factory=TrackerConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     mapping: LocalMappingConfig = field(default_factory=LocalMappingConfig)
+    loops: LoopConfig = field(default_factory=LoopConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +87,11 @@ class Slam:
         self.gates = gates
         self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
         self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking, self.config.seed)
-        self.relocalizer = Relocalizer(self.map, self.config.orb)
-        self.machine = LocalizationMachine(self.tracker, self.relocalizer.find)
-        self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
+        places = Places(self.map)
+        self.machine = LocalizationMachine(self.tracker, Relocalizer(self.map, self.config.orb, places).find)
+        self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
+        self.loops = LoopCloser(self.map, self.config.orb, places, self.config.loops, self.emit)
         self.live = live
         self.mapping = (ThreadedMapping if live else InlineMapping)(self._map)
         self.mapping_ms: list[float] = []
@@ -105,8 +114,11 @@ class Slam:
         self.close()
 
     def close(self) -> None:
-        """Wait until the last keyframe is mapped."""
+        """Wait until the last keyframe is mapped, then adjust the whole map once more."""
         self.mapping.close()
+        if self.config.final_iterations and len(self.map.keyframes):
+            orb, sigma_px = self.config.orb, self.config.mapping.sigma_px
+            adjust(self.map, self.map.alive_keyframes, orb, sigma_px, self.config.final_iterations, None)
 
     def feed(self, message: Message) -> Estimate | None:
         """One message; an estimate for every frame."""
@@ -190,6 +202,8 @@ class Slam:
     def _map(self, keyframe: int) -> None:
         clock = Stopwatch()
         self.mapper.process(keyframe, self.mapping.interrupted)
+        if self.map.keyframes.alive[keyframe]:
+            self.loops.process(keyframe, self.mapping.interrupted)
         self.mapping_ms.append(clock.ms())
 
     def _candidate(self, tracked: Tracked) -> Candidate:

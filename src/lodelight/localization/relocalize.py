@@ -27,7 +27,7 @@ class RelocalizerConfig:
     hint_angle_deg : how far a keyframe's view may be turned from a hinted pose to be looked at
     """
 
-    sigma_px: float = 0.8
+    sigma_px: float = 1.0
     candidates: int = 5
     min_inliers: int = 30
     min_coverage: float = 0.3

@@ -25,7 +25,7 @@ class KeyframeConfig:
 
     max_interval_s: float = 1.0
     min_interval_s: float = 0.0
-    overlap: float = 0.75
+    overlap: float = 0.8
     overlap_young: float = 0.4
     weak_overlap: float = 0.25
     weak_tracking_override: bool = True

@@ -41,7 +41,7 @@ class LoopConfig:
     iterations : of the adjustment of the whole map after a loop
     """
 
-    sigma_px: float = 0.8
+    sigma_px: float = 1.0
     min_shared: int = 15
     candidates: int = 3
     min_similarity: float = 0.6
