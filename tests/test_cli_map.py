@@ -13,7 +13,6 @@ from lodelight.cli.main import main
 from lodelight.mapping.store import save_map
 from maps import room_map, room_rig
 
-
 POINTS = len(room_map(n_keyframes=20, n_points=1000).points)
 
 
@@ -40,7 +39,8 @@ def test_info_of_a_file_or_of_the_folder_it_is_in(path: Path, capsys: pytest.Cap
     )
     status, out, _ = run(capsys, "info", path)
     assert status == 0
-    assert "20 over 0.9 s" in out or "20 over 1.0 s" in out
+    assert "keyframes  20 over 0.9 s" in out  # 19 steps of 50 ms
+    assert "notes      seed 7\n" in out
 
 
 def test_check_is_0_for_a_sound_map_1_for_a_damaged_one_and_2_for_none(

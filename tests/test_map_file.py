@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -239,6 +240,30 @@ def test_a_killed_save_leaves_one_whole_map_and_the_next_save_clears_up(tmp_path
         halfway += len(os.listdir(tmp_path)) > 1
     assert halfway > 0  # some kills must have come in the middle of a save, or nothing was tried
     save_map(room_map(), path)
+    assert os.listdir(tmp_path) == ["map.lode"]
+
+
+def test_savers_of_one_map_wait_for_each_other(tmp_path: Path) -> None:
+    path, maps = tmp_path / "map.lode", [room_map(seed) for seed in range(3)]
+    wanted = set()
+    for map in maps:
+        save_map(map, path)
+        wanted.add(path.read_bytes())
+    failed: list[Exception] = []
+
+    def save_often(map: Map) -> None:
+        try:
+            for _ in range(10):
+                save_map(map, path)
+        except Exception as error:
+            failed.append(error)
+
+    savers = [threading.Thread(target=save_often, args=(map,)) for map in maps]
+    for saver in savers:
+        saver.start()
+    while any(saver.is_alive() for saver in savers):
+        assert path.read_bytes() in wanted
+    assert failed == []
     assert os.listdir(tmp_path) == ["map.lode"]
 
 

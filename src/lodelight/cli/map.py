@@ -114,6 +114,7 @@ def _told(found: dict[str, Any]) -> str:
         "keyframes": f"{found['keyframes']} over {path}, {found['loops']} loops",
         "points": f"{found['points']} in {size} m, seen {found['observations']} times in {found['features']} features",
         "sensors": f"{found['sensors']}: {', '.join(found['cameras'])}",
-        **found["notes"],
     }
+    if found["notes"]:
+        lines["notes"] = ", ".join(f"{key} {value}" for key, value in found["notes"].items())
     return "\n".join(f"{key:<10} {value}" for key, value in lines.items())

@@ -57,7 +57,7 @@ def run(
         wall_s = time.perf_counter() - begun_s
         for skipped in recording.skipped:
             outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)
-        save_map(slam.map, out / "map.lode")
+        save_map(slam.map, out / "map.lode", {"source": recording.name, "seed": seed})
         metrics = outputs.finish(
             slam.trajectory(), slam.cloud(), {**slam.stats(), "skipped": len(recording.skipped)},
             recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
