@@ -194,6 +194,12 @@ def test_saving_through_a_link_replaces_what_it_leads_to(saved: Path, tmp_path: 
     assert map_info(saved)["keyframes"] == 3
 
 
+def test_permissions_of_the_earlier_map_are_kept(saved: Path) -> None:
+    saved.chmod(0o600)
+    save_map(room_map(seed=1), saved)
+    assert saved.stat().st_mode & 0o777 == 0o600
+
+
 def test_info_tells_counts_and_notes(saved: Path) -> None:
     map, info = room_map(sigma_px=0.5), map_info(saved)
     assert info["keyframes"] == len(map.keyframes)

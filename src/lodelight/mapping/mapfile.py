@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 import sys
 from collections.abc import Iterator
@@ -70,8 +71,8 @@ def check_header(path: Path) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """A name beside `path` to write to. What was written takes the place of `path` at once, safe on the disk.
 
-    Until then, and after a kill or a full disk at any moment, the earlier file stands untouched. A failed save
-    removes what it wrote; what a killed one left is removed by the next save in the same folder.
+    Until then, and after a kill or a full disk at any moment, the earlier file stands untouched; its permissions pass
+    to the new one. A failed save removes what it wrote; what a killed one left is removed by the next of that map.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
@@ -84,6 +85,8 @@ def replacing(path: Path) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
+            if path.exists():
+                shutil.copymode(path, temporary)
             os.replace(temporary, path)
             if folder is not None:
                 os.fsync(folder)
