@@ -179,7 +179,7 @@ class _Adjustment:
                         return
                     if self._linearize(self.trial, self.trial_linear, robust, self.linear.chi2) <= self.linear.cost:
                         break
-                damping *= 10.0
+                damping = max(10.0 * damping, DAMPING_START)
                 if damping > DAMPING_MAX:
                     return
             damping = max(0.1 * damping, DAMPING_MIN)
