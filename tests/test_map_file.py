@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import resource
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -211,37 +211,28 @@ def test_info_tells_counts_and_notes(saved: Path) -> None:
 
 # -- kills and full disks ---------------------------------------------------------------------------------------
 
-SAVE_FOR_EVER = """
-import sys, numpy as np
-from maps import room_map
-from lodelight.mapping.store import save_map
-maps = [room_map(seed, n_keyframes=40, n_points=2000) for seed in (1, 2)]
-print("ready", flush=True)
-while True:
-    for map in maps:
-        save_map(map, sys.argv[1])
-"""
+
+def save_for_ever(maps: list[Map], path: Path) -> None:
+    while True:
+        for map in maps:
+            save_map(map, path)
 
 
 def test_a_killed_save_leaves_one_whole_map_and_the_next_save_clears_up(tmp_path: Path) -> None:
     path = tmp_path / "map.lode"
+    maps = [room_map(seed, n_keyframes=40, n_points=2000) for seed in (1, 2)]
     wanted = []
-    for seed in (1, 2):
-        save_map(room_map(seed, n_keyframes=40, n_points=2000), path)
+    for map in maps:
+        save_map(map, path)
         wanted.append(path.read_bytes())
     rng = np.random.default_rng(0)
     halfway = 0
-    for _ in range(12):
-        process = subprocess.Popen(
-            [sys.executable, "-c", SAVE_FOR_EVER, str(path)], stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        )  # fmt: skip
-        assert process.stdout is not None
-        process.stdout.readline()
-        time.sleep(rng.uniform(0.0, 0.1))
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
+    for _ in range(30):
+        process = multiprocessing.get_context("fork").Process(target=save_for_ever, args=(maps, path))
+        process.start()
+        time.sleep(rng.uniform(0.02, 0.1))
+        process.kill()
+        process.join()
         assert path.read_bytes() in wanted
         halfway += len(os.listdir(tmp_path)) > 1
     assert halfway > 0  # some kills must have come in the middle of a save, or nothing was tried
