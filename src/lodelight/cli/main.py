@@ -20,7 +20,7 @@ from lodelight.errors import LodelightError, RunError
 
 # name: (module, the first line of its help)
 COMMANDS = {
-    "sim": ("lodelight.cli.sim", "Render a simulated building as a recording with truth."),
+    "sim": ("lodelight.cli.sim", "Render a named building as a recording with ground truth, rig and anchors."),
     "run": ("lodelight.cli.run", "SLAM over a recording: trajectory, map and report."),
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),
     "eval": ("lodelight.cli.evaluate", "Compare a trajectory with the truth: ATE, RPE, coverage, NEES."),
