@@ -45,7 +45,7 @@ class _CompileClock(event.Listener):  # type: ignore[misc, unused-ignore]
 
 
 _clock = _CompileClock()
-event.register("numba:compiler_lock", _clock)
+event.register("numba:compiler_lock", _clock)  # type: ignore[no-untyped-call]
 
 
 def compile_seconds() -> float:

@@ -46,7 +46,7 @@ def _replaced(config: C, keys: list[str], text: str, path: str) -> C:
     else:
         new = _parsed(text, hints[keys[0]], path)
     try:
-        return dataclasses.replace(config, **{keys[0]: new})  # type: ignore[type-var, no-any-return]
+        return dataclasses.replace(config, **{keys[0]: new})  # type: ignore[type-var]
     except ValueError as error:
         raise ConfigError(f"setting {path}={text}: {error}") from None
 

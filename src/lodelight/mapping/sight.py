@@ -60,8 +60,8 @@ def points_of_keyframes(map: Map, keyframes: Ints) -> Ints:
     if len(keyframes) == 0:
         return np.zeros(0, np.int32)
     rows = np.concatenate([map.points_of(int(k)) for k in keyframes])
-    points = np.unique(rows[rows >= 0])
-    return points[map.points.alive[points]].astype(np.int32)
+    points: Ints = np.unique(rows[rows >= 0]).astype(np.int32)
+    return points[map.points.alive[points]]
 
 
 def in_sight(
