@@ -83,7 +83,7 @@ def bundle_adjust(
 ) -> BundleResult:
     """Most likely poses and points.
 
-    iterations : at most so many with all observations, under Huber's kernel if `robust`
+    iterations : at most so many with all observations, under Cauchy's kernel if `robust`
     polish : then so many without kernel on the inliers alone (the two stages of local adjustment: 5 and 10)
     stop : asked between iterations; the best state so far is returned
     covariance_of : keyframes whose marginal covariance is wanted, with all points uncertain; it counts what the last

@@ -14,7 +14,7 @@ import numpy as np
 
 from lodelight.compiled import kernel
 from lodelight.estimation.factors.reprojection import CHI2_PX, CHI2_PX_DEPTH, reprojection
-from lodelight.estimation.robust import huber
+from lodelight.estimation.robust import cauchy
 from lodelight.geometry.dense import inverse3
 from lodelight.geometry.so3 import so3_perturbed
 from lodelight.types import Array, Bools, Ints
@@ -53,11 +53,11 @@ def linearize(
         )  # fmt: skip
         bound = math.inf if not robust else CHI2_PX_DEPTH if inv_depth[i] > 0.0 else CHI2_PX
         chi2[i] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-        value, w = huber(chi2[i], bound)
+        value, w = cauchy(chi2[i], bound)
         if rows == 0:
             chi2[i] = math.inf
             if active[i] and before[i] < math.inf:
-                comparable += weight[i] * huber(before[i], bound)[0]
+                comparable += weight[i] * cauchy(before[i], bound)[0]
         if rows == 0 or not active[i]:
             for c in range(3):
                 for a in range(6):

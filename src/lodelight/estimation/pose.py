@@ -1,6 +1,6 @@
 """One pose against points that are held fixed: the estimate of every frame.
 
-Levenberg-Marquardt on the reprojection factor in rounds. The first rounds carry Huber's kernel; after each, every
+Levenberg-Marquardt on the reprojection factor in rounds. The first rounds carry Cauchy's kernel; after each, every
 observation is tested again at the 95 % bound, so that one taken for an outlier can return; the last rounds run on the
 inliers alone, without kernel, where the estimate is efficient and its covariance the inverse of the information.
 """
@@ -23,7 +23,7 @@ from lodelight.estimation.factors.reprojection import (
     inliers_of,
     reprojection,
 )
-from lodelight.estimation.robust import huber
+from lodelight.estimation.robust import cauchy
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.dense import cholesky, cholesky_solve, matmul, spd_inverse
 from lodelight.geometry.se3 import SE3
@@ -125,12 +125,12 @@ def _linearize(
         if rows == 0:
             chi2[i] = math.inf
             if active[i] and before[i] < math.inf:
-                comparable += weight[i] * huber(before[i], bound)[0]
+                comparable += weight[i] * cauchy(before[i], bound)[0]
             continue
         chi2[i] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
         if not active[i]:
             continue
-        value, w = huber(chi2[i], bound)
+        value, w = cauchy(chi2[i], bound)
         cost += weight[i] * value
         if before[i] < math.inf:
             comparable += weight[i] * value

@@ -1,11 +1,23 @@
-"""Huber's kernel on the squared, whitened residual of a whole observation.
+"""Robust kernels on the squared, whitened residual of a whole observation.
 
-Source: Huber 1964; iteratively reweighted as in Zhang, "Parameter estimation techniques", 1997.
+Source: Huber 1964; Cauchy as in Zhang, "Parameter estimation techniques", 1997, iteratively reweighted.
 """
 
 import math
 
 from lodelight.compiled import kernel
+
+
+@kernel
+def cauchy(chi2: float, bound: float) -> tuple[float, float]:
+    """(cost, weight) of a squared norm: its influence grows up to chi2 = bound and fades beyond; bound inf = none.
+
+    One wrong match close to the camera can be off by thousands of sigmas with all the leverage of its nearness; under
+    Huber's kernel, whose influence never fades, it alone turned keyframes by degrees (fr1_rpy with frames dropped).
+    """
+    if bound == math.inf:
+        return chi2, 1.0
+    return bound * math.log1p(chi2 / bound), 1.0 / (1.0 + chi2 / bound)
 
 
 @kernel
