@@ -33,7 +33,9 @@ from lodelight.types import AnyArray, Array, Bools
 ROUNDS = 4
 ROBUST_ROUNDS = 2
 ITERATIONS = 10
-# A step whose predicted gain in chi-square is below this moves the pose by 1e-5 of its own standard deviation.
+# A round ends where the next step promises less gain in chi-square: it would move the pose by the root of that, in its
+# own standard deviations. A robust round has found its inliers at 0.1; the last rounds go on to 1e-5.
+SETTLED_CHI2 = 1e-2
 CONVERGED_CHI2 = 1e-10
 # What is known of a pose indoors when nothing is measured: it keeps a covariance finite where points do not.
 BROAD_SIGMA_RAD = math.pi
@@ -170,7 +172,7 @@ def _optimize(
                 gain = 0.0
                 for a in range(6):
                     gain -= g[a] * step[a]
-                if gain < CONVERGED_CHI2:
+                if gain < (SETTLED_CHI2 if robust else CONVERGED_CHI2):
                     break
                 trial_R, trial_p = matmul(R, so3_exp(step[:3])), p + step[3:]
                 trial_cost, comparable = _linearize(
