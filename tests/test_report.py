@@ -123,5 +123,5 @@ def test_a_run_that_saw_next_to_nothing_has_a_report_too(tmp_path, frames):
         for t_ns in stamps:
             outputs.frame(Estimate(t_ns, "tracking", SE3.identity(), np.eye(6)), 1.0, 0.0)
         path = Trajectory.from_poses(stamps, [SE3.identity()] * frames)
-        outputs.finish(path, np.zeros((0, 3)), {}, walk(30), wall_s=1.0, compile_s=0.0, recording_s=0.0)
+        outputs.finish(path, np.full((frames, 3), np.nan), {}, walk(30), wall_s=1.0, compile_s=0.0, recording_s=0.0)
     assert "Tracked" in (tmp_path / "report.html").read_text()

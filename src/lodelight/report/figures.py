@@ -17,7 +17,7 @@ Figure: TypeAlias = dict[str, Any]
 MAX_SAMPLES = 6000
 MAX_POINTS = 30_000
 
-FINAL, LIVE, TRUTH, SECOND = "#2f7ff0", "#f08a24", "#8a94a3", "#b657d6"
+FINAL, LIVE, TRUTH = "#2f7ff0", "#f08a24", "#8a94a3"
 STATE_COLOURS = {
     "initializing": "#9aa5b4",
     "tracking": "#2fa866",
@@ -81,8 +81,7 @@ def states(run: RunFolder) -> Figure:
                     "hovertemplate": "%{base:.2f} s, for %{x:.2f} s<extra>" + state + "</extra>",
                 }
             )
-    figure = over_time(traces, "", yaxis={"visible": False, "fixedrange": True}, barmode="overlay")
-    return figure
+    return over_time(traces, "", yaxis={"visible": False, "fixedrange": True}, barmode="overlay")
 
 
 def timing(run: RunFolder) -> Figure:
@@ -136,14 +135,8 @@ def errors_over(run: RunFolder, abscissa: str) -> Figure:
         x, metres, degrees = broken(e.t_ns, thinned(len(e.t_ns), e.position_m), x, e.position_m, e.rotation_deg)
         traces.append(line(x, 100 * metres, f"{name}, cm", colour))
         traces.append(line(x, degrees, f"{name}, deg", colour, yaxis="y2", line={"width": 1, "dash": "dot"}))
-    right = {
-        "title": {"text": "rotation (deg)"},
-        "overlaying": "y",
-        "side": "right",
-        "tickmode": "auto",
-        "rangemode": "tozero",
-    }
-    figure = over_time(traces, "position (cm)", yaxis2={**right, "showgrid": False})
+    right = {"overlaying": "y", "side": "right", "tickmode": "auto", "rangemode": "tozero", "showgrid": False}
+    figure = over_time(traces, "position (cm)", yaxis2={"title": {"text": "rotation (deg)"}, **right})
     if abscissa != "time":
         figure["time"] = False
         figure["layout"]["xaxis"]["title"]["text"] = "distance travelled (m)"
@@ -170,9 +163,8 @@ def plane(run: RunFolder, axes: str) -> Figure:
 
 def space(run: RunFolder) -> Figure:
     """Map points, coloured by height, with path and keyframes; far strays are left outside the box."""
-    xyz = run.cloud_xyz[
-        np.linspace(0, len(run.cloud_xyz), min(len(run.cloud_xyz), MAX_POINTS), endpoint=False, dtype=int)
-    ]
+    count = len(run.cloud_xyz)
+    xyz = run.cloud_xyz[np.linspace(0, count, min(count, MAX_POINTS), endpoint=False, dtype=int)]
     if run.final.alignment is not None and len(xyz):
         a = run.final.alignment
         xyz = a.scale * xyz @ a.R.T + a.t
@@ -204,10 +196,8 @@ def _xyz(points: AnyArray) -> Figure:
 
 def _box(points: AnyArray, path: Array) -> tuple[Array, Array]:
     """The path and the middle 98 % of the points in every axis, with a tenth to spare."""
-    corners = [*(np.percentile(points, (1, 99), axis=0) if len(points) else []), *path]
-    if not corners:
-        return -np.ones(3), np.ones(3)
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    inside = np.vstack([path, np.percentile(points, (1, 99), axis=0)]) if len(points) else path
+    low, high = inside.min(axis=0), inside.max(axis=0)
     spare = 0.1 * (high - low) + 0.05
     return low - spare, high + spare
 

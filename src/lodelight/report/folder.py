@@ -87,7 +87,7 @@ def read_folder(out: Path, truth: Trajectory | None, mode: Mode) -> RunFolder:
         final=_placed(_poses(out / "trajectory.tum"), truth, mode),
         live=_placed(_poses(out / "trajectory_live.tum"), truth, mode),
         truth=truth,
-        cloud_xyz=cloud,
+        cloud_xyz=cloud[np.isfinite(cloud).all(axis=1)],
         sigma_t_ns=t_ns,
         sigma_m=np.sqrt(variances[:, 3:].sum(axis=1)),
         sigma_deg=np.rad2deg(np.sqrt(variances[:, :3].sum(axis=1))),

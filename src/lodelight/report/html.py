@@ -44,7 +44,7 @@ def write_report(out: Path, truth: Trajectory | None, mode: Mode = "se3") -> Pat
         js=(page / "page.js").read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
         # a text in the data must not end the script that holds it
-        data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
+        data=json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
     )
     write_text(out / "report.html", document)
     return out / "report.html"
@@ -151,10 +151,6 @@ def _events(run: RunFolder) -> tuple[list[dict[str, Any]], str]:
 
 
 def _word(value: Any) -> str:
-    return (
-        f"{value:.4g}"
-        if isinstance(value, float)
-        else json.dumps(value)
-        if isinstance(value, list | dict)
-        else str(value)
-    )
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return json.dumps(value) if isinstance(value, list | dict) else str(value)
