@@ -20,6 +20,7 @@ from lodelight.errors import LodelightError, RunError
 
 # name: (module, the first line of its help)
 COMMANDS = {
+    "demo": ("lodelight.cli.demo", "Simulate a small building, run what there is on it, say how exact it was."),
     "sim": ("lodelight.cli.sim", "Render a named building as a recording with ground truth, rig and anchors."),
     "run": ("lodelight.cli.run", "SLAM over a recording: trajectory, map and report."),
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),

@@ -11,6 +11,8 @@ import typer
 
 if TYPE_CHECKING:
     from lodelight.io.recording import Recording
+    from lodelight.mapping.map import Map
+    from lodelight.slam import SlamConfig
 
 app = typer.Typer(add_completion=False)
 
@@ -30,42 +32,62 @@ def run(
     as_json: bool = typer.Option(False, "--json", help="Print metrics.json."),
 ) -> None:
     """SLAM over a recording: trajectory, map and report."""
+    from lodelight.errors import RunError
+    from lodelight.io.sources import open_source
+    from lodelight.mapping.store import load_map
+    from lodelight.settings import with_settings
+    from lodelight.slam import SlamConfig
+
+    recording = open_source(source, rig)
+    config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), settings)
+    known = load_map(map_file) if map_file else None
+    metrics = slam_to_folder(recording, out, config, known, live, start, end)
+    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out))
+    if metrics["tracked_fraction"] == 0.0:
+        raise RunError(f"{source}: no frame could be localized; {out / 'events.jsonl'} says why")
+
+
+def slam_to_folder(
+    recording: Recording,
+    out: Path,
+    config: SlamConfig,
+    known: Map | None = None,
+    live: bool = False,
+    start_s: float = 0.0,
+    end_s: float = float("inf"),
+) -> dict[str, Any]:
+    """Run SLAM over a recording and write the out folder; returns what `metrics.json` holds.
+
+    known : a loaded map to continue; live : paced by the stamps
+    """
     import cv2
 
     from lodelight.cli.progress import track
     from lodelight.compiled import compile_seconds
-    from lodelight.errors import RunError
-    from lodelight.io.sources import open_source
-    from lodelight.mapping.store import load_map, save_map
+    from lodelight.mapping.store import save_map
     from lodelight.report.outputs import Outputs
-    from lodelight.settings import as_table, with_settings
-    from lodelight.slam import Slam, SlamConfig
+    from lodelight.settings import as_table
+    from lodelight.slam import Slam
 
     cv2.setNumThreads(1)  # whole stages run on two threads; image operations that split further only get in the way
-    recording = open_source(source, rig)
-    config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), settings)
-    known = load_map(map_file) if map_file else None
-    asked = {"source": str(source), "live": live, "start_s": start, "map": str(map_file) if map_file else None}
+    asked = {"source": str(recording.path), "live": live, "start_s": start_s, "map": known is not None}
     with Outputs(out, {"run": asked, **as_table(config)}) as outputs:
         begun_s, compiled_s = time.perf_counter(), compile_seconds()
         slam = Slam(recording.rig, config, map=known, on_event=outputs.event, live=live)
-        mapped, stamps = 0, [0]
-        for estimate in track(slam.run(recording, start, end), "SLAM", recording.n_frames):
+        mapped, first_ns, last_ns = 0, None, 0
+        for estimate in track(slam.run(recording, start_s, end_s), "SLAM", recording.n_frames):
             outputs.frame(estimate, estimate.details["track_ms"], sum(slam.mapping_ms[mapped:]))
             mapped = len(slam.mapping_ms)
-            stamps = [stamps[0] or estimate.t_ns, estimate.t_ns]
+            first_ns, last_ns = first_ns or estimate.t_ns, estimate.t_ns
         wall_s = time.perf_counter() - begun_s
         for skipped in recording.skipped:
             outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)
-        save_map(slam.map, out / "map.lode", {"source": recording.name, "seed": seed})
-        metrics = outputs.finish(
+        save_map(slam.map, out / "map.lode")
+        return outputs.finish(
             slam.trajectory(), slam.cloud(), {**slam.stats(), "skipped": len(recording.skipped)},
             recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
-            recording_s=(stamps[-1] - stamps[0]) * 1e-9,
+            recording_s=(last_ns - (first_ns or last_ns)) * 1e-9,
         )  # fmt: skip
-    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out))
-    if metrics["tracked_fraction"] == 0.0:
-        raise RunError(f"{source}: no frame could be localized; {out / 'events.jsonl'} says why")
 
 
 def _visual(recording: Recording) -> str:
