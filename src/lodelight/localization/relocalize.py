@@ -30,7 +30,7 @@ class RelocalizerConfig:
     sigma_px: float = 1.0
     candidates: int = 5
     min_inliers: int = 30
-    min_coverage: float = 0.3
+    min_coverage: float = 0.35
     hint_angle_deg: float = 60.0
 
 

@@ -48,7 +48,7 @@ class LoopConfig:
     pair: PairConfig = field(default_factory=PairConfig)
     strong_inliers: int = 60
     confirm_within: int = 3
-    drift: float = 0.1
+    drift: float = 0.05
     drift_m: float = 0.3
     drift_deg: float = 5.0
     iterations: int = 10

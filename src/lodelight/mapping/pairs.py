@@ -20,7 +20,7 @@ class PairConfig:
     """
 
     min_inliers: int = 30
-    min_coverage: float = 0.3
+    min_coverage: float = 0.35
     min_agreement: float = 0.5
 
 

@@ -17,7 +17,7 @@ from lodelight.types import AnyArray, ArrayF32, Bools, Ints, Words
 COMMON_WORDS = 0.8  # of the most that any keyframe shares: fewer, and it is no candidate
 GROUP_SIZE = 10  # covisible keyframes whose scores a candidate adds to its own
 GROUP_SCORE = 0.75  # of the best group's score: lower, and the group is no candidate
-GROUPS_LOOKED_AT = 40  # a bound on the time of a query, far above what the rules above leave
+GROUPS_LOOKED_AT = 15  # the most similar: a bound on the time of a query, above what the rules above mostly leave
 
 
 @kernel
