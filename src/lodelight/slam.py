@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lodelight.compiled import compile_seconds
+from lodelight.errors import ConfigError
 from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
@@ -83,6 +84,7 @@ class Slam:
         live: bool = False,
     ) -> None:
         self.config = config or SlamConfig()
+        _check_sensors(self.config.sensors, known=map is not None)
         self.map = map if map is not None else Map(rig)
         self.gates = gates
         self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
@@ -234,6 +236,13 @@ class Slam:
             tracked.t_ns, self.machine.status, tracked.T_world_body, covariance, self.machine.why,
             tracked.n_inliers, {"track_ms": clock.ms()},
         )  # fmt: skip
+
+
+def _check_sensors(sensors: str, known: bool) -> None:
+    if sensors.endswith("-inertial"):
+        raise ConfigError(f"{sensors}: this version does not use the IMU; choose {sensors.removesuffix('-inertial')}")
+    if sensors == "mono" and not known:
+        raise ConfigError("mono alone gives a map no scale; choose rgbd or stereo, or give a map with --map")
 
 
 class Stopwatch:

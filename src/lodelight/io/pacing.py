@@ -27,30 +27,35 @@ class Paced:
         self._lock = threading.Lock()
 
     def __iter__(self) -> Iterator[Message]:
-        threading.Thread(target=self._play, name="pacing", daemon=True).start()
-        while True:
-            item = self._queue.get()
-            if item is None:
-                return
-            if isinstance(item, BaseException):
-                raise item
-            if isinstance(item, Frame):
-                with self._lock:
-                    self._waiting -= 1
-                    late = self._waiting >= QUEUE_FRAMES
-                if late:
-                    self._on_drop(item.t_ns)
-                    continue
-            yield item
+        left = threading.Event()
+        threading.Thread(target=self._play, args=(left,), name="pacing", daemon=True).start()
+        try:
+            while (item := self._queue.get()) is not None:
+                if isinstance(item, BaseException):
+                    raise item
+                if not isinstance(item, Frame) or self._in_time(item):
+                    yield item
+        finally:
+            left.set()
 
-    def _play(self) -> None:
+    def _in_time(self, frame: Frame) -> bool:
+        with self._lock:
+            self._waiting -= 1
+            late = self._waiting >= QUEUE_FRAMES
+        if late:
+            self._on_drop(frame.t_ns)
+        return not late
+
+    def _play(self, left: threading.Event) -> None:
+        """Put every message into the queue when it is due, until the consumer has left."""
         start_s: float | None = None
         try:
             for message in self._messages:
                 due_s = message.t_ns / NS_PER_S
                 if start_s is None:
                     start_s = time.monotonic() - due_s
-                time.sleep(max(0.0, start_s + due_s - time.monotonic()))
+                if left.wait(max(0.0, start_s + due_s - time.monotonic())):
+                    break
                 if isinstance(message, Frame):
                     with self._lock:
                         self._waiting += 1
@@ -58,3 +63,7 @@ class Paced:
             self._queue.put(None)
         except BaseException as error:
             self._queue.put(error)
+        finally:
+            close = getattr(self._messages, "close", None)
+            if close is not None:
+                close()
