@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from lodelight.anchors import Anchors, Light, Tag
+from lodelight.errors import ConfigError
 from lodelight.geometry.se3 import SE3
 from lodelight.io.anchors_toml import tag_payload
 from lodelight.sim import prints
+from lodelight.sim.faults import Faults
 from lodelight.sim.materials import MATERIALS, Material, make
 from lodelight.sim.mesh import Mesh
+from lodelight.sim.people import Crowd
 from lodelight.sim.scene import Lamp, Scene, assemble
 from lodelight.types import Array, ArrayF32
 
 DECAL_GAP_M = 0.004  # nearer to its wall a picture would fight with it for the pixels
 MOVED_SHARE, MOVED_M, DARK_SHARE = 0.5, 0.35, 0.15  # what a `changed` building changes
-PANEL_LM, DISC_LM = 4000.0, 1600.0
+FREQUENCIES_HZ = range(2000, 8001, 200)  # above flicker, below half of a phone camera's row rate (science note A1)
+PANEL_LM, DISC_LM = 3600.0, 900.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,7 @@ class Building:
     anchors: Anchors
     route: Array
     height_m: float
+    crowd: Crowd | None = None
 
 
 @dataclass(eq=False)
@@ -48,12 +53,14 @@ class Builder:
     route: Array
     height_m: float
     changed: bool = False
+    faults: Faults = field(default_factory=Faults)
     mesh: Mesh = field(init=False)
     pictures: dict[str, ArrayF32] = field(default_factory=dict)
     lamps: list[Lamp] = field(default_factory=list)
     tags: list[Tag] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
     _items: int = 0
+    _prints: dict[str, tuple[ArrayF32, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.mesh = Mesh(self.random("mesh"))
@@ -100,6 +107,13 @@ class Builder:
         self.pictures[name] = image
         return name
 
+    def shared(self, kind: Callable[[np.random.Generator], ArrayF32], number: int) -> str:
+        """One of a stock of pictures that many things carry, made when first asked for."""
+        name = f"{kind.__name__} {number}"
+        if name not in self.pictures:
+            self.pictures[name] = kind(self.random(name))
+        return name
+
     def decal(self, x: float, y: float, z: float, yaw_deg: float, size: tuple[float, float], image: ArrayF32) -> None:
         """A picture of (width, height) m on a wall, its middle at (x, y, z); yaw is where it faces."""
         a = math.radians(yaw_deg)
@@ -136,13 +150,35 @@ class Builder:
             image, margin = prints.qr(tag_payload(tag if surveyed else Tag(family, label, size_m)))
         else:
             image, margin = prints.fiducial(family, number)
-        side = size_m * margin
-        self.decal(x - DECAL_GAP_M * math.cos(a), y - DECAL_GAP_M * math.sin(a), z, yaw_deg, (side, side), image)
+        self._prints[label] = image, size_m * margin
+        if label == self.faults.moved_tag:
+            self._hang(label, T, 0.5)
+        else:
+            self._hang(label, T, 0.0)
+
+    def _hang(self, label: str, T_world_tag: SE3, lower_m: float) -> None:
+        """Put the print of a tag where a tag is, or `lower_m` below it."""
+        side = self._prints[label][1]
+        x, y = 0.5 * side * T_world_tag.R[:, 0], 0.5 * side * T_world_tag.R[:, 1]
+        corner = T_world_tag.t - x - y + lower_m * T_world_tag.R[:, 1]
+        with self.world():
+            u, v = 2.0 * x, 2.0 * y
+            self.mesh.quad(_triple(corner), _triple(u), _triple(v), self._code(label), fills=True)
+
+    def _code(self, label: str) -> str:
+        name = f"code {label}"
+        self.pictures[name] = self._prints[label][0]
+        return name
 
     def panel(self, x: float, y: float, z: float, size: tuple[float, float], lumen: float = PANEL_LM) -> None:
         """An office lamp that hums at twice the mains, flat under the ceiling."""
         luminance = lumen / (math.pi * size[0] * size[1])
         self._lamp(Lamp(self._under(x, y, z), np.array([0.0, 0.0, -1.0]), size, luminance))
+
+    def next_frequency(self) -> float:
+        """A frequency for the next coded light: all of the plan in a shuffled order, then again from the first."""
+        order = self.random("frequencies").permutation(len(FREQUENCIES_HZ))
+        return float(FREQUENCIES_HZ[order[len(self.lights) % len(order)]])
 
     def coded(
         self, x: float, y: float, z: float, frequency_hz: float, radius_m: float = 0.09, lumen: float = DISC_LM
@@ -151,6 +187,8 @@ class Builder:
         label = f"L{len(self.lights) + 1:02d}"
         center = self._under(x, y, z)
         self.lights.append(Light(label, frequency_hz, center, radius_m=radius_m))
+        if label == self.faults.light:  # it blinks as another light does; the survey does not know
+            frequency_hz += 600.0 if frequency_hz < 7000.0 else -600.0
         phase = float(self.random(f"phase {label}").uniform())
         side = 4.0 * radius_m  # the face shows the wings of the bell beyond the rim
         luminance = lumen / (math.pi * math.pi * radius_m**2)
@@ -229,7 +267,7 @@ class Builder:
                 rise, deep = (0.0, 0.0, bottom - top), 2 * half
                 self.mesh.quad((s, -half, top), (0, deep, 0), rise, "laminate")
                 self.mesh.quad((e, half, top), (0, -deep, 0), rise, "laminate")
-                self.mesh.quad((s, half, top), (e - s, 0, 0), (0, -deep, 0), "laminate")
+                self.mesh.quad((s, -half, top), (e - s, 0, 0), (0, deep, 0), "laminate")
                 if bottom > 0:
                     self.mesh.quad((s, half, bottom), (e - s, 0, 0), (0, -deep, 0), "laminate")
             for s, side in ((0.0, -1.0), (length, 1.0)):
@@ -243,8 +281,29 @@ class Builder:
 
     def finish(self) -> Building:
         """Pack everything; the light is not baked yet."""
+        self._check_faults()
+        if self.faults.duplicated_tag:
+            where = self.tags[-1].T_world_tag
+            assert where is not None
+            self._hang(self.faults.duplicated_tag, where, 0.4)
+        crowd = Crowd(self.route, self.faults.people, self.seed) if self.faults.people else None
         surfaces: dict[str, Material] = {name: Material(image) for name, image in self.pictures.items()}
-        used = {q.surface for q in self.mesh.quads} | {"stain"}
+        used = {q.surface for q in self.mesh.quads + (crowd.quads if crowd else [])} | {"stain"}
         surfaces |= {name: make(name, self.seed) for name in sorted(used) if name in MATERIALS}
-        scene = assemble(self.mesh, surfaces, self.lamps)
-        return Building(self.name, scene, Anchors(tuple(self.tags), tuple(self.lights)), self.route, self.height_m)
+        scene = assemble(self.mesh, surfaces, self.lamps, crowd.quads if crowd else None)
+        anchors = Anchors(tuple(self.tags), tuple(self.lights))
+        return Building(self.name, scene, anchors, self.route, self.height_m, crowd)
+
+    def _check_faults(self) -> None:
+        tags, lights = {tag.id for tag in self.tags}, {light.id for light in self.lights}
+        for label, known in (
+            (self.faults.moved_tag, tags),
+            (self.faults.duplicated_tag, tags),
+            (self.faults.light, lights),
+        ):
+            if label and label not in known:
+                raise ConfigError(f"{self.name} has no {label!r} to go wrong; it has {', '.join(sorted(known))}")
+
+
+def _triple(v: Array) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])

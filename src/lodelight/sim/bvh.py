@@ -141,47 +141,32 @@ def _build(lo: Array, hi: Array) -> tuple[Array, Ints, Ints]:
 
 
 @kernel
-def hit_quad(geometry: Array, q: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
-    """Distance along the ray at which it meets quad q, or inf."""
-    g = geometry[q]
-    slope = g[3] * dx + g[4] * dy + g[5] * dz
-    rx, ry, rz = ox - g[0], oy - g[1], oz - g[2]
-    t = -(g[3] * rx + g[4] * ry + g[5] * rz) / slope
-    if not t > 0.0:
-        return np.inf
-    px, py, pz = rx + t * dx, ry + t * dy, rz + t * dz
-    a = g[6] * px + g[7] * py + g[8] * pz
-    b = g[9] * px + g[10] * py + g[11] * pz
-    return t if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 else np.inf
-
-
-@kernel
 def cast_ray(
-    boxes: Array,
-    links: Ints,
-    order: Ints,
-    geometry: Array,
-    origin: Array,
-    direction: Array,
-    reach: float,
+    boxes: Array, links: Ints, order: Ints, g: Array, stack: Ints, origin: Array, direction: Array, reach: float,
     any_hit: bool,
-) -> tuple[float, int]:
-    """(distance, quad) of the nearest hit within `reach`, or (inf, -1); with `any_hit` of the first one found."""
+) -> tuple[float, int]:  # fmt: skip
+    """(distance, quad) of the nearest hit within `reach`, or (inf, -1); with `any_hit` of the first one found.
+
+    g : geometry table; stack : (STACK,) to work in
+    """
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
-    ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
-    stack = np.empty(STACK, np.int32)
+    # 0 / 0 in the slab test would be no number; a ray turned by 1e-30 is the same ray
+    ix, iy, iz = (
+        1.0 / (dx if dx != 0.0 else 1e-30),
+        1.0 / (dy if dy != 0.0 else 1e-30),
+        1.0 / (dz if dz != 0.0 else 1e-30),
+    )
     stack[0] = 0
     top, best, best_quad = 1, reach, -1
     while top > 0:
         top -= 1
         node = stack[top]
-        b = boxes[node]
-        t0, t1 = (b[0] - ox) * ix, (b[3] - ox) * ix
+        t0, t1 = (boxes[node, 0] - ox) * ix, (boxes[node, 3] - ox) * ix
         near, far = min(t0, t1), max(t0, t1)
-        t0, t1 = (b[1] - oy) * iy, (b[4] - oy) * iy
+        t0, t1 = (boxes[node, 1] - oy) * iy, (boxes[node, 4] - oy) * iy
         near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
-        t0, t1 = (b[2] - oz) * iz, (b[5] - oz) * iz
+        t0, t1 = (boxes[node, 2] - oz) * iz, (boxes[node, 5] - oz) * iz
         near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
         if far < 0.0 or near > far + 1e-9 or near > best:
             continue
@@ -190,9 +175,17 @@ def cast_ray(
             top += 2
             continue
         for i in range(links[node, 0], links[node, 0] + links[node, 1]):
-            t = hit_quad(geometry, order[i], ox, oy, oz, dx, dy, dz)
-            if t < best:
-                best, best_quad = t, order[i]
+            q = order[i]
+            rx, ry, rz = ox - g[q, 0], oy - g[q, 1], oz - g[q, 2]
+            slope = g[q, 3] * dx + g[q, 4] * dy + g[q, 5] * dz
+            t = -(g[q, 3] * rx + g[q, 4] * ry + g[q, 5] * rz) / slope
+            if not 0.0 < t < best:
+                continue
+            px, py, pz = rx + t * dx, ry + t * dy, rz + t * dz
+            a = g[q, 6] * px + g[q, 7] * py + g[q, 8] * pz
+            b = g[q, 9] * px + g[q, 10] * py + g[q, 11] * pz
+            if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0:
+                best, best_quad = t, q
                 if any_hit:
                     return best, best_quad
     return (best, best_quad) if best_quad >= 0 else (np.inf, -1)

@@ -7,6 +7,8 @@ import numpy as np
 from lodelight.sim import prints
 from lodelight.sim.builder import Builder
 
+STOCK = 48  # different cartons in a building
+
 
 def table(b: Builder, x: float, y: float, yaw_deg: float, size: tuple[float, float, float], top: str = "oak") -> None:
     """size : width, depth, height m."""
@@ -26,13 +28,18 @@ def _sheet(b: Builder, rng: np.random.Generator, w: float, d: float, h: float) -
     kind = rng.random()
     with b.mesh.at(px, py, h, rng.uniform(0, 360)):
         if kind < 0.55:
-            name = b.picture(prints.papers(rng))
+            name = b.shared(prints.papers, int(rng.integers(STOCK)))
             b.mesh.quad((-0.1, 0.15, 0.004), (0.21, 0, 0), (0, -0.297, 0), name, fills=True)
         elif kind < 0.8:
             cover = b.picture(prints.poster(rng))
             b.mesh.box((0, 0, 0.02), (0.15, 0.22, 0.04), "laminate", faces={"t": cover}, skip="u")
         else:
-            b.mesh.box((0, 0, 0.08), (0.2, 0.14, 0.16), "cardboard", faces={"f": b.picture(prints.label(rng))})
+            b.mesh.box(
+                (0, 0, 0.08),
+                (0.2, 0.14, 0.16),
+                "cardboard",
+                faces={"f": b.shared(prints.label, int(rng.integers(STOCK)))},
+            )
 
 
 def desk(b: Builder, x: float, y: float, yaw_deg: float, partition: bool = True) -> None:
@@ -46,7 +53,7 @@ def desk(b: Builder, x: float, y: float, yaw_deg: float, partition: bool = True)
         if partition:
             b.mesh.box((0, 0.4, 0.62), (1.55, 0.05, 1.24), "fabric")
             for _ in range(int(rng.integers(1, 4))):
-                note = b.picture(prints.papers(rng))
+                note = b.shared(prints.papers, int(rng.integers(STOCK)))
                 px, pz = rng.uniform(-0.6, 0.5), rng.uniform(0.95, 1.15)
                 b.mesh.quad((px, 0.37, pz + 0.1), (0.15, 0, 0), (0, 0, -0.2), note, fills=True)
         px = rng.uniform(-0.25, 0.15)
@@ -55,7 +62,7 @@ def desk(b: Builder, x: float, y: float, yaw_deg: float, partition: bool = True)
             b.mesh.box((0, 0.03, 0.1), (0.05, 0.03, 0.2), "metal")
             face = b.picture(prints.screen(rng))
             b.mesh.box((0, 0, 0.31), (0.54, 0.04, 0.33), "metal", faces={"f": face})
-        keys = b.picture(prints.keyboard(rng))
+        keys = b.shared(prints.keyboard, 0)
         b.mesh.box((px, -0.15, 0.75), (0.42, 0.14, 0.02), "metal", faces={"t": keys}, skip="u")
         for _ in range(int(rng.integers(1, 4))):
             _sheet(b, rng, 1.4, 0.6, 0.74)
@@ -103,7 +110,7 @@ def cabinet(b: Builder, x: float, y: float, yaw_deg: float, size: tuple[float, f
 def carton_at(b: Builder, rng: np.random.Generator, x: float, y: float, z: float, side: float) -> None:
     """A carton with labels, `side` m or so."""
     w, d, h = side * rng.uniform(0.8, 1.3), side * rng.uniform(0.7, 1.0), side * rng.uniform(0.6, 1.1)
-    faces = {side: b.picture(prints.label(rng)) for side in "flrb"[: int(rng.integers(1, 4))]}
+    faces = {side: b.shared(prints.label, int(rng.integers(STOCK))) for side in "flrb"[: int(rng.integers(1, 4))]}
     with b.mesh.at(x, y, z, float(rng.uniform(-12, 12))):
         b.mesh.box((0, 0, h / 2), (w, d, h), "cardboard", faces=faces, skip="u", shade=float(rng.uniform(0.8, 1.15)))
 
@@ -114,7 +121,7 @@ def cartons(b: Builder, x: float, y: float, yaw_deg: float, count: int, side: fl
         z = 0.0
         for _ in range(count):
             w, d, h = side * rng.uniform(0.8, 1.2), side * rng.uniform(0.8, 1.1), side * rng.uniform(0.6, 1.0)
-            faces = {s: b.picture(prints.label(rng)) for s in "fr"}
+            faces = {s: b.shared(prints.label, int(rng.integers(STOCK))) for s in "fr"}
             with b.mesh.at(float(rng.uniform(-0.05, 0.05)), float(rng.uniform(-0.05, 0.05)), z, rng.uniform(-10, 10)):
                 b.mesh.box((0, 0, h / 2), (w, d, h), "cardboard", faces=faces)
             z += h
@@ -164,7 +171,11 @@ def rack(b: Builder, x: float, y: float, yaw_deg: float, length: float, levels: 
                 if rng.random() < 0.88:
                     h = float(rng.uniform(0.35, pitch - 0.3))
                     shade, d = float(rng.uniform(0.7, 1.25)), float(rng.uniform(0.75, 0.98)) * (deep - 0.15)
-                    faces = {s: b.picture(prints.label(rng)) for s in "fb"} if rng.random() < 0.6 else None
+                    faces = (
+                        {s: b.shared(prints.label, int(rng.integers(STOCK))) for s in "fb"}
+                        if rng.random() < 0.7
+                        else None
+                    )
                     b.mesh.box(
                         (at + w / 2, 0, z + h / 2), (w - 0.04, d, h), "cardboard", faces=faces, skip="u", shade=shade
                     )

@@ -37,7 +37,7 @@ class Gait:
 
 
 GAITS: dict[str, Gait] = {
-    "cart": Gait(0.7, 0.5, 0.9),
+    "cart": Gait(0.9, 0.5, 0.9),
     "walk": Gait(1.0, 1.45, 0.7, 0.02, 0.018, 0.9, 1.0, (0.02, 0.02, 0.01, 4.0, 2.5, 0.8), (0.05, 0.4)),
     "drone": Gait(1.1, 1.5, 0.9, shake=(0.05, 0.05, 0.16, 12.0, 2.0, 2.0), band_hz=(0.05, 0.5), bank=1.0),
     "hand": Gait(0.45, 1.4, 0.6, 0.008, 0.01, 0.8, 0.6, (0.05, 0.05, 0.06, 12.0, 6.0, 4.0), (0.08, 0.7)),
@@ -81,6 +81,18 @@ def generate(
     return Motion.from_controls(np.hstack([xy, z[:, None], quat]), start_ns, duration_s)
 
 
+def lap_seconds(gait: Gait, route: Array) -> float:
+    """Time of one lap of a closed route, about: bends slow it down."""
+    _, heading = _rounded(route, gait.round_m)
+    return float(STEP_M * np.sum(1.0 / _slow(gait, heading)) / gait.speed)
+
+
+def _slow(gait: Gait, heading: Array) -> Array:
+    """Factor on the speed along the route: less in bends."""
+    bend = np.abs(np.gradient(heading, STEP_M))
+    return _circular((1.0 / np.sqrt(1.0 + (gait.speed * bend / TURN_RATE) ** 2))[:, None], _window(0.3))[:, 0]
+
+
 def _ramp(t: Array) -> Array:
     """0 before 0, 1 after RAMP_S, smooth to the second derivative."""
     u = np.clip(t / RAMP_S, 0.0, 1.0)
@@ -90,8 +102,7 @@ def _ramp(t: Array) -> Array:
 def _progress(gait: Gait, t: Array, heading: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """(way along the route m, speed m/s) at times t: slower in bends, and wandering by an eighth."""
     wander = gait.speed * (1.0 + 0.12 * _noise(t, (0.03, 0.12), rng)) * _ramp(t)
-    bend = np.abs(np.gradient(heading, STEP_M))
-    slow = _circular((1.0 / np.sqrt(1.0 + (gait.speed * bend / TURN_RATE) ** 2))[:, None], _window(0.3))[:, 0]
+    slow = _slow(gait, heading)
     along, speed = np.zeros(len(t)), np.zeros(len(t))
     for i in range(len(t)):
         speed[i] = wander[i] * slow[int(along[i] / STEP_M) % len(slow)]

@@ -12,12 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from lodelight.compiled import kernel
-from lodelight.sim.bvh import cast_ray
+from lodelight.sim.bvh import STACK, cast_ray
 from lodelight.sim.scene import ALBEDO, LAMP, LIGHT_FIRST, LIGHT_H, LIGHT_W, Scene
 from lodelight.types import Array, ArrayF32, Ints
 
-GATHER = 48  # rays per texel and bounce
-BOUNCES = 2
+GATHER = (48, 24, 12)  # rays per texel, bounce after bounce: each is fainter and smoother than the one before
 SAMPLES = 2  # per side of a lamp
 OFF_SURFACE_M = 1e-3
 NEGLIGIBLE = 0.004  # of the light straight under a lamp: one lamp's part below it is not traced
@@ -32,7 +31,6 @@ def bake(scene: Scene, threads: int = 2) -> None:
     lamps = np.ascontiguousarray(np.hstack([lamps, areas[:, None]]))
     tree = scene.tree
     direct, smooth, before = (np.zeros_like(scene.light) for _ in range(3))
-    directions = _hemisphere(GATHER)
     n = len(scene.geometry)
     cuts = np.linspace(0, n, 8 * threads + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
@@ -43,7 +41,8 @@ def bake(scene: Scene, threads: int = 2) -> None:
         where = (tree.boxes, tree.links, tree.order, scene.geometry, scene.paint)
         everywhere(_direct, *where, lamps, direct)
         scene.light[:] = direct
-        for _ in range(BOUNCES):
+        for rays in GATHER:
+            directions = _hemisphere(rays)
             before[:] = scene.light
             everywhere(_gather, *where, scene.scale, directions, before, smooth)
             everywhere(_smooth, scene.paint, direct, smooth, scene.light)
@@ -77,7 +76,7 @@ def _direct(
     lamps: Array,
     out: ArrayF32,
 ) -> None:
-    x, d = np.empty(3), np.empty(3)
+    x, d, stack = np.empty(3), np.empty(3), np.empty(STACK, np.int32)
     for q in range(first, last):
         g = geometry[q]
         for k in range(paint[q, LIGHT_W] * paint[q, LIGHT_H]):
@@ -113,7 +112,7 @@ def _direct(
                     part = lamp[8] * lamp[9] * cos_x * cos_l / (max(dist, 0.1) ** 2 * samples * samples)
                     if cos_x <= 0.0 or cos_l <= 0.0:
                         continue
-                    t, _ = cast_ray(boxes, links, order, geometry, x, d, dist - 0.02, True)
+                    t, _ = cast_ray(boxes, links, order, geometry, stack, x, d, dist - 0.02, True)
                     if t == np.inf:
                         total += part
             out[paint[q, LIGHT_FIRST] + k] = total
@@ -133,7 +132,7 @@ def _gather(
     before: ArrayF32,
     out: ArrayF32,
 ) -> None:
-    x, d = np.empty(3), np.empty(3)
+    x, d, stack = np.empty(3), np.empty(3), np.empty(STACK, np.int32)
     n = directions.shape[0]
     for q in range(first, last):
         g = geometry[q]
@@ -148,7 +147,7 @@ def _gather(
                 f = st * directions[j, 0] + ct * directions[j, 1]
                 for i in range(3):
                     d[i] = e * g[12 + i] / ul + f * g[15 + i] / vl + directions[j, 2] * g[3 + i]
-                t, hit = cast_ray(boxes, links, order, geometry, x, d, 1e9, False)
+                t, hit = cast_ray(boxes, links, order, geometry, stack, x, d, 1e9, False)
                 if hit < 0 or paint[hit, LAMP] >= 0:
                     continue
                 h = geometry[hit]

@@ -11,9 +11,10 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from lodelight.types import Array, ArrayF32
+from lodelight.types import Array, ArrayF32, Bytes
 
 SIZE = 1024  # px of a tiling picture
 
@@ -49,20 +50,34 @@ def relief(height: Array, strength: float) -> Array:
 
 def specks(rng: np.random.Generator, share: float, radius_px: tuple[float, float], squash: float = 0.6) -> Array:
     """(SIZE, SIZE) mask of random ellipses that cover about `share` of the area, tiling; values in [0, 1]."""
-    mean_area = np.pi * np.mean(np.square(radius_px)) * squash
-    count = int(share * SIZE * SIZE / mean_area)
-    out = np.zeros((SIZE, SIZE))
-    reach = int(np.ceil(radius_px[1])) + 2
-    yy, xx = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(float)
-    center, radius = rng.integers(0, SIZE, (count, 2)), rng.uniform(*radius_px, count)
-    angle, strength = rng.uniform(0, np.pi, count), rng.uniform(0.5, 1.0, count)
-    for (cy, cx), r, a, s in zip(center, radius, angle, strength, strict=True):
-        e, f = np.cos(a) * xx + np.sin(a) * yy, (np.cos(a) * yy - np.sin(a) * xx) / squash
-        blob = s * np.clip(r - np.hypot(e, f) + 0.5, 0.0, 1.0)
-        rows, cols = (cy + np.arange(-reach, reach + 1)) % SIZE, (cx + np.arange(-reach, reach + 1)) % SIZE
-        at = np.ix_(rows, cols)
-        out[at] = np.maximum(out[at], blob)
-    return out
+    mean_area = np.pi * squash * (radius_px[0] ** 2 + radius_px[0] * radius_px[1] + radius_px[1] ** 2) / 3.0
+    radius = rng.uniform(*radius_px, int(share * SIZE * SIZE / mean_area))
+    return _ellipses(rng, np.zeros((SIZE, SIZE), np.uint8), radius, squash, (120, 255))
+
+
+def leaves(rng: np.random.Generator, smallest_px: float, largest_px: float, squash: float = 0.7) -> Array:
+    """(SIZE, SIZE) shapes of every size over one another, values in [0, 1]: contrast with sharp edges at every scale.
+
+    Radii follow r^-3, which makes the picture look the same at every distance (dead leaves; Lee, Mumford 2001).
+    """
+    count = int(0.6 * (SIZE / smallest_px) ** 2 / (np.pi * squash))
+    u = rng.random(count)
+    radius = (u / largest_px**2 + (1.0 - u) / smallest_px**2) ** -0.5
+    return _ellipses(rng, np.full((SIZE, SIZE), 128, np.uint8), np.sort(radius)[::-1], squash, (0, 255))
+
+
+def _ellipses(rng: np.random.Generator, canvas: Bytes, radius: Array, squash: float, tones: tuple[int, int]) -> Array:
+    """Ellipses of given radii anywhere on a canvas that joins at its edges, in [0, 1]."""
+    center, angle = rng.uniform(0, SIZE, (len(radius), 2)), rng.uniform(0, 180, len(radius))
+    tone = rng.integers(*tones, len(radius), endpoint=True)
+    for (x, y), r, a, grey in zip(center.tolist(), radius.tolist(), angle.tolist(), tone.tolist(), strict=True):
+        axes = int(16 * r), int(16 * max(r * squash, 0.5))  # in sixteenths of a pixel, as `shift` says
+        for cx in (x, x - SIZE if x + r >= SIZE else x + SIZE if x < r else None):
+            for cy in (y, y - SIZE if y + r >= SIZE else y + SIZE if y < r else None):
+                if cx is not None and cy is not None:
+                    at = int(16 * cx), int(16 * cy)
+                    cv2.ellipse(canvas, at, axes, a, 0, 360, grey, -1, cv2.LINE_AA, shift=4)
+    return canvas / 255.0
 
 
 def bond(
@@ -111,9 +126,30 @@ def block(rng: np.random.Generator) -> Material:
 
 
 def roughcast(rng: np.random.Generator) -> Material:
-    """Coarse plaster: grain of some millimetres lit from the side."""
+    """Coarse plaster, patched and weathered: grain of some millimetres lit from the side, chips, blotches."""
     height = fractal(rng, 0.5, 60, 330)
-    return _material(0.6 + relief(height, 0.085) + 0.035 * fractal(rng, 1.0, 3, 200), 1.6, 0.45)
+    patches = leaves(rng, 3.0, 60.0)
+    value = 0.6 * (0.72 + 0.5 * patches) + relief(height, 0.06) + 0.04 * fractal(rng, 1.0, 3, 200)
+    return _material(value * (1.0 - 0.6 * specks(rng, 0.03, (1.0, 5.0))), 2.0, 0.45)
+
+
+def pebbles(rng: np.random.Generator) -> Material:
+    """Washed concrete: stones of every size."""
+    stones = leaves(rng, 2.5, 40.0)
+    return _material(0.16 + 0.62 * stones + 0.02 * fractal(rng, 0.5, 60, 400), 1.9, 0.4)
+
+
+def mosaic(rng: np.random.Generator) -> Material:
+    """Small tiles of many greys."""
+    cells, inside = bond(rng, 32, 32, 0.0, 3.0, 0.4)
+    face = (0.2 + 0.6 * cells) * (1.0 + 0.1 * fractal(rng, 0.8, 10, 500))
+    return _material(0.5 + (face - 0.5) * inside + relief(inside, 0.05), 1.7, 0.3)
+
+
+def slats(rng: np.random.Generator) -> Material:
+    """Upright wooden slats with shadow between them."""
+    board = planks(rng, shade=0.45).picture.T.astype(np.float64)
+    return _material(board * (1.0 - 0.5 * specks(rng, 0.02, (2.0, 8.0), 0.5)), 1.6, 0.35)
 
 
 def paint(rng: np.random.Generator) -> Material:
@@ -139,25 +175,29 @@ def terrazzo(rng: np.random.Generator) -> Material:
 
 
 def tiles(rng: np.random.Generator) -> Material:
-    """Glazed wall tiles with a pale pattern."""
+    """Glazed wall tiles, each with a printed ornament of its own tone."""
     cells, inside = bond(rng, 10, 10, 0.0, 4.0, 0.0)
-    face = 0.7 * (0.8 + 0.3 * cells) * (1.0 + 0.08 * fractal(rng, 1.0, 4, 400))
-    return _material(0.35 + (face - 0.35) * inside + relief(inside, 0.08), 1.5, 0.3)
+    y, x = np.mgrid[0:SIZE, 0:SIZE] % (SIZE / 10) / (SIZE / 10) - 0.5
+    ornament = np.cos(4 * np.pi * np.hypot(x, y)) * np.cos(4 * np.arctan2(y, x)) > 0.25
+    face = (
+        0.68 * (0.75 + 0.4 * cells) * (1.0 - 0.45 * ornament * (cells * 7 % 1)) * (1.0 + 0.08 * fractal(rng, 1, 4, 400))
+    )
+    return _material(0.3 + (face - 0.3) * inside + relief(inside, 0.08), 1.5, 0.35)
 
 
 def carpet(rng: np.random.Generator) -> Material:
     cells, inside = bond(rng, 4, 4, 0.0, 2.0, 0.0)
-    flecks = 0.32 * specks(rng, 0.16, (1.5, 5.0), 0.4) - 0.14 * specks(rng, 0.2, (1.5, 6.0), 0.4)
-    face = (0.26 + flecks) * (0.85 + 0.3 * cells) * (1.0 + 0.22 * fractal(rng, 0.3, 100, 500))
+    flecks = 0.36 * specks(rng, 0.16, (1.5, 9.0), 0.4) - 0.16 * specks(rng, 0.2, (1.5, 9.0), 0.4)
+    face = (0.28 + flecks) * (0.85 + 0.3 * cells) * (1.0 + 0.22 * fractal(rng, 0.3, 100, 500))
     return _material(face * (0.8 + 0.2 * inside), 2.0, 0.5)
 
 
 def ceiling(rng: np.random.Generator) -> Material:
     """Mineral fibre tiles of 0.6 m with pinholes and fissures in their frame."""
     _, inside = bond(rng, 3, 3, 0.0, 12.0, 0.0)
-    holes = np.maximum(specks(rng, 0.035, (0.9, 2.4), 1.0), specks(rng, 0.05, (2.0, 8.0), 0.25))
-    face = 0.72 * (1.0 + 0.03 * fractal(rng, 0.8, 5, 300)) * (1.0 - 0.62 * holes)
-    return _material(0.85 + (face - 0.85) * inside + relief(inside, 0.1), 1.8, 0.25)
+    holes = np.maximum(specks(rng, 0.03, (0.9, 2.4), 1.0), specks(rng, 0.10, (4.0, 14.0), 0.3))
+    face = 0.76 * (1.0 + 0.04 * fractal(rng, 0.8, 5, 300)) * (1.0 - 0.7 * holes)
+    return _material(0.85 + (face - 0.85) * inside + relief(inside, 0.1), 1.8, 0.3)
 
 
 def planks(rng: np.random.Generator, shade: float = 0.42) -> Material:
@@ -205,9 +245,24 @@ def cardboard(rng: np.random.Generator) -> Material:
     return _material(0.44 * (1.0 + 0.05 * flutes + 0.1 * fractal(rng, 1.0, 2, 200)), 1.2, 0.5)
 
 
+def vinyl(rng: np.random.Generator) -> Material:
+    """A plain floor covering."""
+    return _material(0.45 * (1.0 + 0.015 * fractal(rng, 0.8, 10, 400)), 2.0, 0.08)
+
+
+def corrugated(rng: np.random.Generator) -> Material:
+    """Ribbed sheet with rust and rivets, ribs upright."""
+    rib = np.cos(2 * np.pi * np.arange(SIZE) / (SIZE / 16))[None, :]
+    rust = np.clip(fractal(rng, 1.0, 2, 300) - 0.6, 0.0, 1.5)
+    value = 0.5 * (1.0 + 0.28 * rib + 0.06 * fractal(rng, 0.7, 10, 500)) * (1.0 - 0.35 * rust)
+    return _material(value * (1.0 - 0.6 * specks(rng, 0.02, (2.0, 6.0))), 2.4, 0.4)
+
+
 def rock(rng: np.random.Generator) -> Material:
+    """Hewn stone, lit from the side."""
+    facets = leaves(rng, 4.0, 90.0, 0.55)
     height = fractal(rng, 1.3, 3, 400)
-    return _material(0.34 * (1.0 + 0.2 * fractal(rng, 1.0, 3, 400)) + relief(height, 0.5), 3.0, 0.6)
+    return _material(0.2 + 0.28 * facets + relief(height, 0.35), 3.0, 0.6)
 
 
 def lamp_face(rng: np.random.Generator) -> Material:
@@ -218,8 +273,8 @@ def lamp_face(rng: np.random.Generator) -> Material:
 MATERIALS: dict[str, Callable[[np.random.Generator], Material]] = {
     f.__name__: f
     for f in (
-        stain, brick, block, roughcast, paint, concrete, asphalt, terrazzo, tiles, carpet, ceiling, planks, oak,
-        laminate, metal, fabric, cork, cardboard, rock, lamp_face,
+        stain, brick, block, roughcast, pebbles, mosaic, slats, paint, concrete, asphalt, terrazzo, tiles, carpet,
+        ceiling, planks, oak, laminate, metal, fabric, cork, cardboard, vinyl, corrugated, rock, lamp_face,
     )
 }  # fmt: skip
 MATERIALS["white_brick"] = lambda rng: brick(rng, body=0.68, joint=0.5)

@@ -7,7 +7,7 @@ product rule. Quintics rather than the usual cubics: those have a jerk that jump
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,7 @@ class Motion:
     """T_world_body over `duration_s` from `start_ns` on. spline : of (x, y, z, qw, qx, qy, qz) over seconds.
 
     deviation_m, deviation_deg : how far, at most, it leaves the trajectory it was fitted to
+    jump : (at, ahead) s: from `at` on, the body is where it would have been `ahead` later
     """
 
     spline: BSpline
@@ -58,6 +59,7 @@ class Motion:
     duration_s: float
     deviation_m: float = 0.0
     deviation_deg: float = 0.0
+    jump: tuple[float, float] | None = None
 
     @staticmethod
     def from_controls(controls: Array, start_ns: int, duration_s: float) -> Motion:
@@ -80,11 +82,13 @@ class Motion:
         state = motion.at(t)
         off = np.linalg.norm(state.xyz - given.xyz, axis=1)
         turn = (Rotation.from_matrix(state.R_world_body).inv() * Rotation.from_quat(given.quat_xyzw)).magnitude()
-        return Motion(spline, motion.start_ns, motion.duration_s, float(off.max()), float(np.degrees(turn.max())))
+        return replace(motion, deviation_m=float(off.max()), deviation_deg=float(np.degrees(turn.max())))
 
     def at(self, t_s: Array | float) -> State:
         """States at seconds from the start."""
         t = np.clip(np.atleast_1d(np.asarray(t_s, dtype=np.float64)), 0.0, self.duration_s)
+        if self.jump is not None:
+            t = np.where(t >= self.jump[0], t + self.jump[1], t)
         value, first, second = self.spline(t), self.spline(t, 1), self.spline(t, 2)
         s, ds = value[:, 3:], first[:, 3:]
         length = np.linalg.norm(s, axis=1, keepdims=True)
@@ -105,8 +109,7 @@ class Motion:
         size = np.linalg.norm(c[:, 3:], axis=1, keepdims=True)
         quat = (turn * Rotation.from_quat(c[:, [4, 5, 6, 3]])).as_quat()[:, [3, 0, 1, 2]] * size
         controls = np.hstack([c[:, :3] @ T_new_old.R.T + T_new_old.t, _continuous_quat(quat)])
-        spline = BSpline(self.spline.t, controls, DEGREE)
-        return Motion(spline, self.start_ns, self.duration_s, self.deviation_m, self.deviation_deg)
+        return replace(self, spline=BSpline(self.spline.t, controls, DEGREE))
 
     def trajectory(self, rate_hz: float) -> Trajectory:
         """Poses at a rate, from start to end."""

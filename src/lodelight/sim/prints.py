@@ -266,18 +266,28 @@ def papers(rng: np.random.Generator) -> ArrayF32:
 
 
 def outside(rng: np.random.Generator) -> ArrayF32:
-    """What a window shows: houses and trees under a bright sky, behind a cross of bars."""
-    h, w = 256, 256
-    image = 0.75 + 0.2 * np.linspace(1, 0, h)[:, None] + np.zeros((h, w))
-    skyline = np.repeat(rng.uniform(0.35, 0.75, 16), 16) * h
-    body = np.repeat(rng.uniform(0.12, 0.5, 16), 16)
-    below = np.arange(h)[:, None] > skyline[None, :]
-    image = np.where(below, body[None, :], image)
-    panes = (np.arange(h)[:, None] % 14 < 7) & (np.arange(w)[None, :] % 10 < 5) & below
-    image = np.where(panes, image * rng.uniform(0.4, 1.6, (h, w)), image)
-    image[:8], image[-8:], image[:, :8], image[:, -8:] = 0.1, 0.1, 0.1, 0.1
-    image[:, w // 2 - 4 : w // 2 + 4] = 0.1
-    return _finish(image, rng, 0.01)
+    """What a window shows: houses behind trees under a bright sky, and the cross of its bars."""
+    h = w = 256
+    image = (
+        0.7 + 0.25 * np.linspace(1, 0, h)[:, None] + 0.05 * rng.standard_normal((16, 16)).repeat(16, 0).repeat(16, 1)
+    )
+    blocks = 12
+    edges = np.sort(rng.integers(0, w, blocks - 1))
+    for x0, x1 in zip([0, *edges], [*edges, w], strict=True):
+        top = int(h * rng.uniform(0.2, 0.65))
+        house = rng.uniform(0.12, 0.55) * np.ones((h - top, int(x1 - x0)))
+        rows, columns = int(rng.integers(9, 18)), int(rng.integers(7, 14))
+        lit = (np.arange(h - top)[:, None] % rows < rows // 2) & (
+            np.arange(int(x1 - x0))[None, :] % columns < columns // 2
+        )
+        image[top:, x0:x1] = np.where(lit, house * rng.uniform(0.3, 1.8), house)
+    canvas = np.ascontiguousarray(image, dtype=np.float32)
+    for _ in range(120):  # leaves
+        at = int(rng.integers(0, w)), int(h - abs(rng.normal(0, 0.16)) * h)
+        cv2.circle(canvas, at, int(rng.integers(3, 11)), float(rng.uniform(0.05, 0.35)), -1)
+    canvas[:8], canvas[-8:], canvas[:, :8], canvas[:, -8:] = 0.1, 0.1, 0.1, 0.1
+    canvas[:, w // 2 - 4 : w // 2 + 4] = 0.1
+    return _finish(canvas.astype(np.float64), rng, 0.01)
 
 
 def marking(text: str) -> ArrayF32:

@@ -30,11 +30,14 @@ from lodelight.io.text import read_text, write_text
 from lodelight.io.trajectories import write_tum
 from lodelight.rig import CameraSpec, Rig
 from lodelight.sim.builder import Building
+from lodelight.sim.contact import write_contact_sheet
 from lodelight.sim.depth import sense_depth
+from lodelight.sim.faults import Faults
 from lodelight.sim.imager import Imager
 from lodelight.sim.imu import ImuSeries
 from lodelight.sim.metering import exposures
 from lodelight.sim.motion import Motion
+from lodelight.sim.plan import write_plan
 from lodelight.sim.sensor import Exposure, seed_of
 from lodelight.trajectory import Trajectory
 from lodelight.types import AnyArray
@@ -47,6 +50,7 @@ SETTINGS = "simulation.json"
 class Simulation:
     """All that determines a recording: the same values give the same bytes.
 
+    rig : as it is; stated : as it is written down, None = the same
     settings : what it was made from, in plain values; written beside the recording and compared on resuming
     """
 
@@ -55,6 +59,8 @@ class Simulation:
     rig: Rig
     imu: ImuSeries | None
     seed: int = 0
+    faults: Faults = field(default_factory=Faults)
+    stated: Rig | None = None
     settings: dict[str, object] = field(default_factory=dict)
 
     def stamps(self, spec: CameraSpec) -> NDArray[np.int64]:
@@ -62,6 +68,18 @@ class Simulation:
         count = int(np.floor(self.motion.duration_s * spec.rate_hz + 1e-9)) + 1
         true = self.motion.start_ns + np.round(np.arange(count) * (NS_PER_S / spec.rate_hz)).astype(np.int64)
         return true - round(spec.time_offset_s * NS_PER_S)
+
+    @property
+    def summary(self) -> dict[str, object]:
+        """What was simulated, for a person or a script."""
+        return {
+            "duration_s": round(self.motion.duration_s, 3),
+            "path_m": round(self.motion.trajectory(20.0).length_m, 2),
+            "tags": len(self.building.anchors.tags),
+            "lights": len(self.building.anchors.lights),
+            "trajectory_deviation_m": round(self.motion.deviation_m, 5),
+            "trajectory_deviation_deg": round(self.motion.deviation_deg, 4),
+        }
 
 
 Shot = dict[str, AnyArray]  # folder: image
@@ -81,13 +99,14 @@ def record(
     """
     out = Path(out)
     _claim(out, simulation.settings)
-    folders = write_sensors(out, simulation.rig, str(simulation.settings.get("scenario", "")))
+    folders = write_sensors(out, simulation.stated or simulation.rig, str(simulation.settings.get("scenario", "")))
     _write_texts(simulation, out, folders)
     done = {name: set(written_stamps(folder)) for name, folder in folders.items() if (folder / "data.csv").exists()}
     jobs = [job for job in _jobs(simulation) if any(job[0] not in done[name] for name in job[1])]
     steps = _run(jobs, folders, done, threads)
     for _ in progress(steps, len(jobs)) if progress else steps:
         pass
+    write_contact_sheet(out)
     return out
 
 
@@ -112,6 +131,8 @@ def _claim(out: Path, settings: dict[str, object]) -> None:
 def _write_texts(simulation: Simulation, out: Path, folders: dict[str, Path]) -> None:
     """All that needs no rendering: anchors, truth, inertial data."""
     write_anchors(out / "anchors.toml", simulation.building.anchors)
+    for name in ("plan.png", "plan.html"):
+        write_plan(out / name, simulation.building, simulation.motion)
     imu, motion = simulation.imu, simulation.motion
     t_ns = imu.t_ns if imu is not None else simulation.stamps(simulation.rig.cameras[0])
     t_ns = t_ns[(t_ns >= motion.start_ns) & (t_ns <= motion.start_ns + round(motion.duration_s * NS_PER_S))]
@@ -131,16 +152,19 @@ def _write_texts(simulation: Simulation, out: Path, folders: dict[str, Path]) ->
 
 def _jobs(simulation: Simulation) -> list[Job]:
     """Every image of every camera by time; depth comes with the image of camera 0."""
-    rig, scene, motion = simulation.rig, simulation.building.scene, simulation.motion
+    rig, building, motion = simulation.rig, simulation.building, simulation.motion
     jobs: list[Job] = []
     lead = rig.cameras[0]
-    metered = exposures(scene, lead, motion, simulation.stamps(lead))
+    metered = exposures(building, lead, motion, simulation.stamps(lead))
+    kept = simulation.faults.kept(len(metered), np.random.default_rng([simulation.seed, 5]))
     for number, spec in enumerate([*rig.cameras, *([rig.lights] if rig.lights else [])]):
-        imager = Imager(scene, spec, motion)
+        imager = Imager(building, spec, motion)
         is_light = spec is rig.lights
         folder = "light0" if is_light else f"cam{number}"
         names = [folder, "depth0"] if number == 0 and rig.depth else [folder]
         for index, t in enumerate(simulation.stamps(spec).tolist()):
+            if not is_light and not kept[index]:
+                continue
             exposure = Exposure(spec.exposure_s, LIGHT_GAIN) if is_light else metered[index]
             jobs.append((t, names, _shot(simulation, imager, names, t, exposure, number, index)))
     return sorted(jobs, key=lambda job: (job[0], job[1]))
@@ -150,7 +174,8 @@ def _shot(
     simulation: Simulation, imager: Imager, names: list[str], t_ns: int, exposure: Exposure, number: int, index: int
 ) -> Callable[[], Shot]:
     def work() -> Shot:
-        image, view = imager.take(t_ns, exposure, seed_of(simulation.seed, number, index))
+        covered = simulation.faults.dark(imager.true_s(t_ns))
+        image, view = imager.take(t_ns, exposure, seed_of(simulation.seed, number, index), covered)
         shot: Shot = {names[0]: image}
         if len(names) > 1 and simulation.rig.depth is not None:
             depth = sense_depth(view.depth, simulation.rig.depth, seed_of(simulation.seed, 100 + number, index))

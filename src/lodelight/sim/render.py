@@ -54,10 +54,13 @@ class View:
     quad: Ints
 
 
-def render(scene: Scene, eye: Eye, poses: list[SE3], brightness: Array | None = None) -> View:
+def render(
+    scene: Scene, eye: Eye, poses: list[SE3], brightness: Array | None = None, loose: Array | None = None
+) -> View:
     """The view from `poses`, T_world_cam: one for a global shutter, or one per row.
 
     brightness : (H, lamps) factor on each lamp's own radiance while a row is exposed; None = all 1 (or 0 if off)
+    loose : (n, 18) where the scene's loose quads are now; None = where they were built
     """
     h, w = eye.camera.height, eye.camera.width
     pick = np.zeros(h + 2, dtype=int) if len(poses) == 1 else np.clip(np.arange(-1, h + 1), 0, h - 1)
@@ -68,8 +71,9 @@ def render(scene: Scene, eye: Eye, poses: list[SE3], brightness: Array | None = 
     view = View(np.zeros((h, w), np.float32), np.zeros((h, w), np.float32), np.full((h, w), -1, np.int32))
     lamps = np.array([[lamp.radiance, lamp.disc, lamp.size_m[0]] for lamp in scene.lamps]).reshape(-1, 3)
     tree = scene.tree
+    geometry = scene.geometry if loose is None else np.vstack([scene.geometry[: scene.static], loose])
     _render(
-        eye.rays, R, o, tree.boxes, tree.links, tree.order, scene.geometry, scene.static, scene.paint, scene.scale,
+        eye.rays, R, o, tree.boxes, tree.links, tree.order, geometry, scene.static, scene.paint, scene.scale,
         scene.textures.texels, scene.textures.table, scene.light, lamps, brightness, view.image, view.depth, view.quad,
     )  # fmt: skip
     return view

@@ -31,8 +31,12 @@ def standard(
     light_size: tuple[int, int] = (1280, 960),
     light_rate_hz: float = 10.0,
     imu: str = "euroc",
+    body_is_camera: bool = False,
 ) -> Rig:
-    """Stereo, depth registered to camera 0, an upward light camera, an IMU. Lenses scale with `size`."""
+    """Stereo, depth registered to camera 0, an upward light camera, an IMU. Lenses scale with `size`.
+
+    body_is_camera : the trajectory is camera 0's own, z forward, as those of RGB-D recordings are
+    """
     cameras = tuple(
         CameraSpec(f"cam{i}", _lens(lens, size, i), _mounted(FORWARD, (0.06, y, 0.02), i), rate_hz)
         for i, y in enumerate((0.5 * BASELINE_M, -0.5 * BASELINE_M))
@@ -47,6 +51,10 @@ def standard(
         row_time_s=ROW_TIME_S * 960.0 / light_size[1],
         exposure_s=LIGHT_EXPOSURE_S,
     )
+    if body_is_camera:
+        T_cam_body = cameras[0].T_body_cam.inverse()
+        cameras = tuple(replace(spec, T_body_cam=T_cam_body @ spec.T_body_cam) for spec in cameras)
+        light = replace(light, T_body_cam=T_cam_body @ light.T_body_cam)
     return Rig(
         cameras,
         DepthSpec(cameras[0].camera, cameras[0].T_body_cam) if depth else None,

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from lodelight.sim import prints
-from lodelight.sim.builder import Builder, Building
+from lodelight.sim.builder import Builder
 from lodelight.sim.furniture import bookcase, cabinet, cartons, chair, desk, plant, sofa, table
 
+HEIGHT = 3.0
 DOOR = (0.0, 2.1)  # bottom and top of a door's opening, m
 ROUTE = np.array(
     [
@@ -16,11 +17,9 @@ ROUTE = np.array(
         [11.0, 2.5], [8.2, 2.5], [8.0, 4.1],
     ]
 )  # fmt: skip
-FREQUENCIES_HZ = np.arange(2000, 8001, 200)
 
 
-def build(seed: int, changed: bool = False) -> Building:
-    b = Builder("office", seed, ROUTE, 3.0, changed)
+def build(b: Builder) -> None:
     _shell(b)
     _open_plan(b)
     _meeting_room(b)
@@ -28,7 +27,6 @@ def build(seed: int, changed: bool = False) -> Building:
     _pictures(b)
     _tags(b)
     _lamps(b)
-    return b.finish()
 
 
 def _shell(b: Builder) -> None:
@@ -42,18 +40,18 @@ def _shell(b: Builder) -> None:
     sills = tuple((x, x + 1.6, 0.9, 2.5) for x in (1.2, 4.2, 7.2, 10.0, 13.4, 16.6))
     b.wall((0, 0), (20, 0), "roughcast", "roughcast", sills)
     for x0, x1, *_ in sills:
-        b.window(0.5 * (x0 + x1), -0.05, 1.7, 90, (x1 - x0, 1.6), 900.0)
+        b.window(0.5 * (x0 + x1), -0.05, 1.7, 90, (x1 - x0, 1.6), 420.0)
     b.wall((20, 0), (20, 14), "brick", "brick")
-    b.wall((20, 14), (0, 14), "block", "roughcast")
+    b.wall((20, 14), (0, 14), "mosaic", "roughcast")
     b.wall((0, 14), (0, 0), "white_brick", "brick")
-    b.wall((0, 8), (12, 8), "roughcast", "white_brick", ((2.4, 3.6, *DOOR), (9.4, 10.6, *DOOR)))
-    b.wall((12, 8), (20, 8), "roughcast", "oak", ((4.4, 5.6, *DOOR),))
-    b.wall((12, 0), (12, 8), "block", "roughcast", ((1.9, 3.1, *DOOR),))
-    b.wall((20, 10), (12, 10), "brick", "roughcast", ((2.4, 3.6, *DOOR),))
-    b.wall((12, 10), (7, 10), "block", "roughcast", ((2.0, 3.0, *DOOR),))
-    b.wall((7, 10), (0, 10), "tiles", "roughcast", ((3.3, 4.5, *DOOR),))
+    b.wall((0, 8), (12, 8), "pebbles", "white_brick", ((2.4, 3.6, *DOOR), (9.4, 10.6, *DOOR)))
+    b.wall((12, 8), (20, 8), "roughcast", "slats", ((4.4, 5.6, *DOOR),))
+    b.wall((12, 0), (12, 8), "mosaic", "roughcast", ((1.9, 3.1, *DOOR),))
+    b.wall((20, 10), (12, 10), "brick", "white_brick", ((2.4, 3.6, *DOOR),))
+    b.wall((12, 10), (7, 10), "slats", "block", ((2.0, 3.0, *DOOR),))
+    b.wall((7, 10), (0, 10), "mosaic", "tiles", ((3.3, 4.5, *DOOR),))
     b.wall((7, 10), (7, 14), "tiles", "block")
-    b.wall((12, 10), (12, 14), "block", "white_brick")
+    b.wall((12, 10), (12, 14), "pebbles", "white_brick")
 
 
 def _open_plan(b: Builder) -> None:
@@ -170,10 +168,19 @@ def _lamps(b: Builder) -> None:
             b.panel(x, y, 3.0, (1.2, 0.3))
     for x, y in ((3.5, 12.0), (9.5, 12.0), (14.0, 12.0), (18.0, 12.0)):
         b.panel(x, y, 3.0, (0.6, 0.6))
-    places = [(x, y) for y in (1.0, 4.0, 7.0) for x in (1.0, 3.0, 5.0, 7.0, 9.0, 11.0)]
-    places += [(x, 9.0) for x in (1.5, 4.5, 7.5, 10.5, 13.5, 16.5, 18.8)]
-    places += [(13.0, 4.0), (16.0, 4.0), (19.0, 4.0), (16.0, 7.0), (16.0, 1.0)]
-    places += [(14.0, 10.8), (16.2, 12.8), (18.0, 10.8), (2.0, 11.0), (5.0, 13.0)]
-    order = b.random("frequencies").permutation(len(FREQUENCIES_HZ))
-    for i, (x, y) in enumerate(places):
-        b.coded(x, y, 3.0, float(FREQUENCIES_HZ[order[i % len(order)]]))
+    places = [(x, y) for y in (0.8, 2.4, 4.0, 5.6, 7.2) for x in (0.9, 2.6, 4.3, 6.0, 7.7, 9.4, 11.1)]
+    places += [
+        (x, y)
+        for x in (0.8, 2.2, 3.6, 5.0, 6.4, 7.8, 9.2, 10.6, 12.0, 13.4, 14.8, 16.2, 17.6, 19.0)
+        for y in (8.6, 9.4)
+    ]
+    places += [(x, y) for x in (13.0, 14.8, 16.6, 18.4) for y in (0.9, 3.0, 4.9, 7.1)]
+    places += [(x, y) for x in (13.2, 15.0, 17.0, 19.0) for y in (11.0, 12.9)]
+    places += [(x, y) for x in (1.4, 3.4, 5.4, 8.2, 10.6) for y in (11.0, 13.0)]
+    places = [
+        p
+        for p in places
+        if all(abs(p[0] - lamp.center[0]) > 0.8 or abs(p[1] - lamp.center[1]) > 0.4 for lamp in b.lamps)
+    ]
+    for x, y in places:
+        b.coded(x, y, 3.0, b.next_frequency())
