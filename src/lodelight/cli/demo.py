@@ -21,15 +21,14 @@ def demo(
     from lodelight.cli.progress import track
     from lodelight.cli.run import slam_to_folder
     from lodelight.io.sources import open_source
-    from lodelight.sim.rigs import standard
     from lodelight.sim.scenarios import simulate
     from lodelight.slam import SlamConfig
 
-    rig = standard(size=SIZE, rate_hz=RATE_HZ, lights=False)
     source = out / "office"
     simulate(
-        "office", source, seed=seed, duration_s=DURATION_S, rig=rig, progress=lambda i, n: track(i, "rendering", n)
-    )
+        "office", source, seed=seed, duration_s=DURATION_S, size=SIZE, rate_hz=RATE_HZ, lights=False,
+        progress=lambda frames, total: track(frames, "rendering", total),
+    )  # fmt: skip
     print(f"office    {DURATION_S:g} s of stereo and depth, rendered with exact truth: {source}")
     for sensors in ("rgbd", "stereo"):
         recording = open_source(source)
