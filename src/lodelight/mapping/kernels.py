@@ -28,14 +28,41 @@ def _unlink_one(row: int, point: Ints, next_row: Ints, head: Ints, n_obs: Ints) 
 
 
 @kernel
-def link(rows: Ints, points: Ints, point: Ints, next_row: Ints, head: Ints, n_obs: Ints) -> None:
+def link(rows: Ints, points: Ints, point: Ints, next_row: Ints, head: Ints, n_obs: Ints, alive: Bools) -> None:
     for i in range(len(rows)):
         row, m = rows[i], points[i]
-        _unlink_one(row, point, next_row, head, n_obs)
+        before = _unlink_one(row, point, next_row, head, n_obs)
         point[row] = m
         next_row[row] = head[m]
         head[m] = row
         n_obs[m] += 1
+        if before >= 0 and n_obs[before] == 0:
+            alive[before] = False
+
+
+@kernel
+def fuse(
+    old: int, new: int, point: Ints, next_row: Ints, keyframe: Ints, head: Ints, n_obs: Ints, n_visible: Ints,
+    n_found: Ints, replaced_by: Ints, alive: Bools,
+) -> None:  # fmt: skip
+    """`new` takes over the observations of `old`, save in keyframes where it is seen already."""
+    row = head[old]
+    while row >= 0:
+        after = next_row[row]
+        _unlink_one(row, point, next_row, head, n_obs)
+        at = head[new]
+        while at >= 0 and keyframe[at] != keyframe[row]:
+            at = next_row[at]
+        if at < 0:
+            point[row] = new
+            next_row[row] = head[new]
+            head[new] = row
+            n_obs[new] += 1
+        row = after
+    n_visible[new] += n_visible[old]
+    n_found[new] += n_found[old]
+    alive[old] = False
+    replaced_by[old] = new
 
 
 @kernel

@@ -157,7 +157,9 @@ class Map:
     def link(self, features: AnyArray, points: AnyArray) -> None:
         """Feature rows see points. A feature that saw another one is unlinked from it first."""
         f, p = self.features, self.points
-        kernels.link(np.asarray(features, np.int32), np.asarray(points, np.int32), f.point, f.next, p.head, p.n_obs)
+        kernels.link(
+            np.asarray(features, np.int32), np.asarray(points, np.int32), f.point, f.next, p.head, p.n_obs, p.alive
+        )
 
     def unlink(self, features: Iterable[int] | AnyArray) -> None:
         """Feature rows see nothing any more; a point left without observation dies."""
@@ -182,17 +184,9 @@ class Map:
     def fuse_points(self, old: int, new: int) -> None:
         """`new` takes over the observations of `old`, save in keyframes where it is seen already."""
         f, p = self.features, self.points
-        seen_in = {int(f.keyframe[row]) for row in self.observations(new)}
-        rows = self.observations(old)
-        self.unlink(rows)
-        for row in rows:
-            if int(f.keyframe[row]) not in seen_in:
-                seen_in.add(int(f.keyframe[row]))
-                self.link(np.array([row]), np.array([new]))
-        p.n_visible[new] += p.n_visible[old]
-        p.n_found[new] += p.n_found[old]
-        p.alive[old] = False
-        p.replaced_by[old] = new
+        kernels.fuse(
+            old, new, f.point, f.next, f.keyframe, p.head, p.n_obs, p.n_visible, p.n_found, p.replaced_by, p.alive
+        )
 
     def refresh_points(self, points: AnyArray, scale_factor: float, n_levels: int) -> None:
         """Recompute descriptor (the medoid of its observations), normal and scale range of points."""
