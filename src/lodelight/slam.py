@@ -72,6 +72,7 @@ class Slam:
     live : mapping on its own thread; else everything is done in order, the same bytes every time
     on_event : told of every decision, as on_event(t_ns, kind, **fields), from either thread
     mapping_ms : wall time of every keyframe's mapping so far
+    localization_only : set it, and the map is no longer written to
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class Slam:
         self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
         self.loops = LoopCloser(self.map, self.config.orb, places, self.config.loops, self.emit)
         self.live = live
+        self.localization_only = False
         self.mapping = (ThreadedMapping if live else InlineMapping)(self._map)
         self.mapping_ms: list[float] = []
         self.path: list[PathNode] = []
@@ -227,6 +229,8 @@ class Slam:
             since_keyframe_s=(tracked.t_ns - self._last_keyframe_ns) * 1e-9,
             since_relocalization_s=(tracked.t_ns - self._relocalized_ns) * 1e-9,
             mapping_idle=self.mapping.idle,
+            mapping_stopped=self.loops.correcting,
+            localization_only=self.localization_only,
             queue=self.mapping.queued,
         )
 

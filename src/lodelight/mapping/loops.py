@@ -75,6 +75,7 @@ class LoopCloser:
     """Looks for a loop at each new keyframe, and closes those it believes.
 
     on_event : told of every loop accepted or refused, with the reason
+    correcting : the map is being bent, on whichever thread `process` was called
     """
 
     def __init__(
@@ -90,6 +91,7 @@ class LoopCloser:
         self.config = config or LoopConfig()
         self.verifier = Verifier(map, orb, self.config.sigma_px)
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
+        self.correcting = False
         self._awaiting: list[_Awaiting] = []
 
     def process(self, keyframe: int, stop: Callable[[], bool] | None = None) -> LoopResult | None:
@@ -102,7 +104,11 @@ class LoopCloser:
             loop = self._find(keyframe)
         if loop is None:
             return None
-        correction = correct_loop(self.verifier, loop, self._drifted(loop), self.config.iterations, stop)
+        self.correcting = True
+        try:
+            correction = correct_loop(self.verifier, loop, self._drifted(loop), self.config.iterations, stop)
+        finally:
+            self.correcting = False
         return LoopResult(loop, correction)
 
     # -- belief -------------------------------------------------------------------------------------------------
