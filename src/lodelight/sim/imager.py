@@ -44,7 +44,7 @@ class Imager:
         """What is seen from `poses` by rows that open at `opens_s`, with everybody where they are at `t_s`."""
         scene, crowd = self.building.scene, self.building.crowd
         lit = brightness(scene.lamps, opens_s, exposure_s)
-        rows = np.ascontiguousarray(np.broadcast_to(lit, (self.spec.camera.height, lit.shape[1])))
+        rows = np.array(np.broadcast_to(lit, (self.spec.camera.height, lit.shape[1])), order="C")
         return render(scene, self.eye, poses, rows, crowd.geometry(t_s) if crowd else None)
 
     def take(self, t_ns: int, exposure: Exposure, noise_seed: int, covered: bool = False) -> tuple[Bytes, View]:

@@ -179,7 +179,7 @@ def _gather_hits(
     count = 0
     for q in range(static, geometry.shape[0]):
         if not _quad_outside(planes, apex, geometry[q]):
-            _try_quad(geometry[q], q, apex, CELL, o, d, best, ids)
+            _try_quad(geometry[q], np.int64(q), apex, CELL, o, d, best, ids)
             tried[count] = q
             count += 1
     far = _farthest(best, CELL)
@@ -209,7 +209,7 @@ def _gather_hits(
         for i in range(links[node, 0], links[node, 0] + links[node, 1]):
             q = order[i]
             if not _quad_outside(planes, apex, geometry[q]):
-                _try_quad(geometry[q], q, apex, CELL, o, d, best, ids)
+                _try_quad(geometry[q], np.int64(q), apex, CELL, o, d, best, ids)
                 tried[count] = q
                 count += 1
         if count > before:
@@ -270,7 +270,7 @@ def _render(
                     ray_quad[n], ray_row[n] = q, ty + r - 1
                     n += 1
             shade_rays(
-                n, ray_quad, ray_row, ray_o, ray_d, right, down, apex,
+                np.int64(n), ray_quad, ray_row, ray_o, ray_d, right, down, apex,
                 geometry, paint, scale, texels, table, light, lamps, brightness, value, distance,
             )  # fmt: skip
             n = 0
@@ -294,7 +294,7 @@ def _render(
             ray_best[:n] = np.inf
             ray_quad[:n] = -1
             for k in range(count):
-                _try_quad(geometry[tried[k]], tried[k], apex, n, ray_o, ray_d, ray_best, ray_quad)
+                _try_quad(geometry[tried[k]], np.int64(tried[k]), apex, n, ray_o, ray_d, ray_best, ray_quad)
             n = 0
             for j in range(SUB * edges):  # close the gaps of rays that meet nothing
                 if ray_quad[j] >= 0:
@@ -306,7 +306,7 @@ def _render(
                     ray_best[n] = j // SUB
                     n += 1
             shade_rays(
-                n, ray_quad, ray_row, ray_o, ray_d, right, down, apex,
+                np.int64(n), ray_quad, ray_row, ray_o, ray_d, right, down, apex,
                 geometry, paint, scale, texels, table, light, lamps, brightness, value, distance,
             )  # fmt: skip
             for e in range(edges):

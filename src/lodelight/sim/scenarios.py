@@ -49,8 +49,9 @@ class Request:
 
     duration_s : None = LAPS of the building's route, or the whole trajectory given
     motion : cart, walk, drone or hand; None = the building's own
-    trajectory : file to fly instead; place : "auto", "x,y,z,yaw_deg" that moves it, None = as it is, or "auto" where it
-    starts outside the building
+    trajectory : file to fly instead
+    place : "auto" puts the trajectory where there is most room, "x,y,z,yaw_deg" moves it; None = as it is, but "auto"
+    where it starts outside the building or comes with an `imu_file`: then it was made elsewhere
     imu_file : EuRoC csv to pass through unchanged; needs `trajectory`, on the same clock
     rig : standard (body x forward, z up), camera (the body is camera 0), euroc, or a rig.toml; None = euroc for an
     EuRoC csv, else standard
@@ -105,7 +106,7 @@ def prepare(request: Request, threads: int = 2) -> Simulation:
         motion = _route_motion(request, place, faults)
     else:
         motion = _placed(request, given, place)
-    Space(place.scene).check(motion)
+    Space(place).check(motion)
     if request.imu_file is not None:
         series: ImuSeries | None = _passed_imu(Path(request.imu_file), motion, request)
     elif rig.imu is not None:
@@ -213,8 +214,8 @@ def _given_motion(request: Request) -> Motion | None:
 
 
 def _placed(request: Request, motion: Motion, place: Building) -> Motion:
-    space = Space(place.scene)
-    if request.place is None and space.indoors(motion.at(0.0).xyz[0]):
+    space = Space(place)
+    if request.place is None and request.imu_file is None and space.indoors(motion.at(0.0).xyz[0]):
         return motion
     if request.place in (None, "auto"):
         return motion.moved(space.place(motion))

@@ -110,8 +110,8 @@ def shade_rays(
                 taps = min(MAX_TAPS, math.ceil(math.sqrt(long2 / max(short2, 1.0))))
             width2 = max(long2 / (taps * taps), short2)
             lod = min(0.5 * log2_of(width2), levels - 1.0) if width2 > 1.0 else 0.0
-            level = int(lod)
-            part = lod - level
+            level = int(lod) if layer == 0 else int(lod + 0.5)
+            part = lod - level if layer == 0 else 0.0  # stains are smooth: one level does
             total = 0.0
             for j in range(2 if part > 0.0 else 1):
                 # Levels lie one behind the other, each a quarter of the one before

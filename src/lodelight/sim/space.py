@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from lodelight.errors import ConfigError
 from lodelight.geometry.se3 import SE3
+from lodelight.sim.builder import Building
 from lodelight.sim.bvh import STACK, cast_ray
 from lodelight.sim.motion import Motion
 from lodelight.sim.scene import Scene
@@ -23,13 +25,13 @@ STEP_S = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Surfaces of a scene as a cloud of points, and the tree of its quads."""
+    """Surfaces of a building as a cloud of points, and the tree of its quads."""
 
-    scene: Scene
+    building: Building
     _cloud: cKDTree = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_cloud", cKDTree(_surface_points(self.scene)))
+        object.__setattr__(self, "_cloud", cKDTree(_surface_points(self.building.scene)))
 
     def clearance(self, points: Array) -> Array:
         """(N,) m to the nearest surface of (N, 3) m, to SPACING_M / sqrt(2)."""
@@ -42,7 +44,7 @@ class Space:
         if reach < 1e-9:
             return ""
         _, quad = self._cast(a, (b - a) / reach, reach)
-        return "" if quad < 0 else self.scene.names[quad]
+        return "" if quad < 0 else self.building.scene.names[quad]
 
     def indoors(self, point: Array) -> bool:
         """Whether there is something below and above."""
@@ -50,8 +52,8 @@ class Space:
         return all(self._cast(point, d, 1e3)[1] >= 0 for d in (down, up))
 
     def _cast(self, origin: Array, direction: Array, reach: float) -> tuple[float, int]:
-        tree, stack = self.scene.tree, np.empty(STACK, np.int32)
-        g = self.scene.geometry
+        tree, stack = self.building.scene.tree, np.empty(STACK, np.int32)
+        g = self.building.scene.geometry
         return cast_ray(tree.boxes, tree.links, tree.order, g, stack, origin, direction, reach, False)
 
     def check(self, motion: Motion) -> None:
@@ -78,7 +80,7 @@ class Space:
         """
         t = np.linspace(0.0, motion.duration_s, max(50, min(1500, int(10 * motion.duration_s))))
         xyz = motion.at(t).xyz
-        lo, hi = self.scene.tree.boxes[0, :3], self.scene.tree.boxes[0, 3:]
+        lo, hi = self.building.scene.tree.boxes[0, :3], self.building.scene.tree.boxes[0, 3:]
         field_, origin, pitch = self._distance_field(lo, hi)
         heights = _heights(xyz[:, 2], lo[2], hi[2])
         best, best_room = SE3.identity(), 0.0
@@ -105,7 +107,12 @@ class Space:
         pitch = 0.15
         axes = [np.arange(lo[k], hi[k] + pitch, pitch) for k in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        return self.clearance(points.reshape(-1, 3)).reshape(points.shape[:3]), lo, pitch
+        room = self.clearance(points.reshape(-1, 3)).reshape(points.shape[:3])
+        # Of what is free only that counts which the route leads to, not the inside of a wall or the world outside
+        part, _ = label(room > KEEP_M)
+        start = np.array([*self.building.route[0], lo[2] + 0.5 * self.building.height_m])
+        here = part[tuple(np.rint((start - lo) / pitch).astype(int))]
+        return np.where(part == here, room, 0.0), lo, pitch
 
 
 def _surface_points(scene: Scene) -> Array:

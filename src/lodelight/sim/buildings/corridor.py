@@ -25,9 +25,14 @@ def build(b: Builder) -> None:
     ):
         b.floor(a, 0, e, WAY, floor)
         b.ceiling(a, 0, e, WAY, ceiling)
-    for y0, y1, floor in ((WAY, inner_y, "planks"), (inner_y, WIDTH, "carpet")):
-        b.floor(0, y0, LENGTH, y1, floor)
-        b.ceiling(0, y0, LENGTH, y1, "ceiling")
+    north = (0.0, inner_y, LENGTH, WIDTH)
+    for area, floor in (
+        (north, "carpet"),
+        ((0.0, WAY, WAY, inner_y), "planks"),
+        ((inner_x, WAY, LENGTH, inner_y), "planks"),
+    ):
+        b.floor(*area, floor)
+        b.ceiling(*area, "ceiling")
     for a, e, skin in ((0, x0, "roughcast"), (x0, x1, "paint"), (x1, LENGTH, "white_brick")):
         b.wall((a, 0), (e, 0), skin, "brick")
     b.wall((LENGTH, 0), (LENGTH, WIDTH), "brick", "brick")

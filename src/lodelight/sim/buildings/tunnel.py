@@ -74,7 +74,7 @@ def _tube(b: Builder, length: float, i: int) -> None:
     b.mesh.quad((0, -top[0], top[1]), (length, 0, 0), (0, 2 * top[0], 0), "rock")
     for z, y in ((1.9, -1.9), (2.05, -1.85)):
         b.mesh.box((length / 2, y, z), (length, 0.12, 0.05), "metal", shade=0.8)
-    for x in np.arange(2.0, length, 6.0):
+    for x in np.arange(2.0, length - 3.5, 6.0):
         b.mesh.box((x, 1.85, 1.2), (0.4, 0.3, 0.6), "metal", faces={"f": b.shared(prints.label, int(x) % 12)})
         b.mesh.box((x + 3.0, 0.0, 0.02), (0.1, 3.9, 0.04), "metal")
     for k, x in enumerate(np.arange(1.0, length, 4.0)):
