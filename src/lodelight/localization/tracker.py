@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from lodelight.estimation.factors.reprojection import CHI2_PX
 from lodelight.estimation.pose import PoseResult, optimize_pose
 from lodelight.features.features import Features
 from lodelight.features.matching import FeatureIndex, consistent_turn, match_descriptors
@@ -23,6 +24,7 @@ MIN_DEPTH_M = 0.1
 CLOSE_SIGMA = 0.05  # of a depth, as a share of it, up to which a point is put there
 MEDIAN_CHI2_2, MEDIAN_CHI2_3 = 1.386, 2.366  # of a chi-square distribution with 2 and 3 degrees of freedom
 SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it counts as sharp; more is a failure
+INLIERS = 0.95  # of right matches, which pass their test
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
 
 
@@ -77,11 +79,14 @@ class Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A pose from matches. point : (N,) map point of every feature that agrees, or -1; tried : matches there were."""
+    """A pose from matches. point : (N,) map point of every feature that agrees, or -1; tried : matches there were;
+    right : how many of them are, going by how many more agree than would by chance
+    """
 
     solved: PoseResult
     point: Ints
     tried: int
+    right: float
 
 
 class Tracker:
@@ -112,14 +117,14 @@ class Tracker:
         index = FeatureIndex(seen, self.camera.width, self.camera.height)
         recent = self._landmarks_of_frame(last, T_world_last)
         pairs = self._match_predicted(recent, predicted, index)
-        fit = self._fit(predicted, seen, recent, pairs)
+        fit = self._fit(predicted, seen, recent, pairs, self.config.search_px)
         if not self._convincing(fit):
             for landmarks in (recent, self._landmarks_of_keyframe(last.reference)):
                 pairs = self._match_blindly(landmarks, seen)
-                fit = max(fit, self._fit(predicted, seen, landmarks, pairs), key=lambda f: f.solved.n_inliers)
+                fit = max(fit, self._fit(predicted, seen, landmarks, pairs, math.inf), key=lambda f: f.right)
                 if self._convincing(fit):
                     break
-        if fit.solved.n_inliers < self.config.min_matches:
+        if fit.right < self.config.min_matches:
             return self._lost(t_ns, seen, predicted, f"{fit.solved.n_inliers} of {fit.tried} matches fit one pose")
         return self.refine(t_ns, seen, fit.solved.T_world_body, fit.point, index, search=3.0)
 
@@ -209,26 +214,40 @@ class Tracker:
         match = match_descriptors(landmarks.desc, seen.desc, max_hamming=64, ratio=0.8)
         return _pairs(np.arange(len(landmarks.point)), match, landmarks, seen)
 
-    def _fit(self, start: SE3, seen: Features, landmarks: Landmarks, pairs: Ints) -> Fit:
+    def _fit(self, start: SE3, seen: Features, landmarks: Landmarks, pairs: Ints, search_px: float) -> Fit:
         """The pose that most of the pairs agree with, looked for around `start`, then from random samples of them.
 
         Around a prediction that is far off, wrong matches are the nearest: they hold a local optimization there.
+        search_px : how far from where `start` puts them they were looked for, at the finest octave
         """
         feature, xyz = seen.take(pairs[:, 1]), landmarks.xyz[pairs[:, 0]]
         solved, noise = self._solve(start, feature, xyz)
-        if solved.n_inliers < MAJORITY * len(pairs):
+        right = self._right(solved, noise, search_px)
+        if right < MAJORITY * len(pairs):
             drawn = ransac_pnp(feature.ray, xyz, self._sigma_px(feature) / self.camera.focal_px, self.seed)
             if drawn is not None:
                 other, other_noise = self._solve(drawn[0] @ self.T_body_cam.inverse(), feature, xyz)
-                if other.n_inliers / other_noise > solved.n_inliers / noise:
-                    solved, noise = other, other_noise
+                other_right = self._right(other, other_noise, search_px)
+                if other_right / other_noise > right / noise:
+                    solved, noise, right = other, other_noise, other_right
         agreed = pairs[solved.inliers]
         point = np.full(len(seen), -1, np.int32)
         point[agreed[:, 1]] = landmarks.point[agreed[:, 0]]
-        return Fit(solved, point, len(pairs))
+        return Fit(solved, point, len(pairs), right)
 
     def _convincing(self, fit: Fit) -> bool:
-        return fit.solved.n_inliers >= max(self.config.min_matches, MAJORITY * fit.tried)
+        return fit.right >= max(self.config.min_matches, MAJORITY * fit.tried)
+
+    def _right(self, solved: PoseResult, noise: float, search_px: float) -> float:
+        """How many matches are right, going by how many more are inliers than would be if none were.
+
+        A wrong match lies anywhere in the window it was looked for in, so it passes for an inlier as often as the
+        bound's share of that window is large. Where a frame is noisy, that is often: there a wrong pose gathers as
+        many inliers in its windows as the right one, and only matches from the whole image tell them apart.
+        """
+        chance = min(CHI2_PX * (noise * self.config.sigma_px / search_px) ** 2, INLIERS)
+        excess = solved.n_inliers - chance * len(solved.inliers)
+        return excess / (INLIERS - chance) if chance < INLIERS else 0.0
 
     def _solve(self, start: SE3, seen: Features, xyz: Array) -> tuple[PoseResult, float]:
         """Motion-only optimization of features against world positions (N, 3), and by how much this frame's noise
