@@ -176,6 +176,19 @@ def test_depth_is_read_at_the_corner_and_doubted_at_a_rim():
     assert got.sigma_inv_depth[1] * 4 > 0.9
 
 
+@pytest.mark.parametrize("none", [np.nan, np.inf, -1.0])
+def test_what_is_no_depth_is_no_reading_and_makes_no_rim(none):
+    cam = camera()
+    seen = random_features(np.random.default_rng(0), 2, cam)
+    seen.px[:] = [[100.0, 100.0], [300.0, 200.0]]
+    depth = np.full((480, 640), 2.0, np.float32)
+    flat = depth_of_features(seen, depth, DepthSpec(cam, SE3.identity()))
+    depth[100, 100] = depth[200, 301] = none
+    got = depth_of_features(seen, depth, DepthSpec(cam, SE3.identity()))
+    assert got.inv_depth.tolist() == [0.0, 0.5]
+    assert got.sigma_inv_depth.tolist() == [0.0, flat.sigma_inv_depth[1]]
+
+
 def plane_pair(right, T_right_left, z):
     """A textured wall at z m seen by a pinhole left camera and any right camera."""
     left = camera()

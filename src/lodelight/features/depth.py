@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lodelight.compiled import kernel
@@ -37,14 +39,14 @@ def _read(px: ArrayF32, depth: ArrayF32) -> tuple[ArrayF32, ArrayF32]:
     for i in range(len(px)):
         u = min(max(round(px[i, 0]), 0), width - 1)
         v = min(max(round(px[i, 1]), 0), height - 1)
-        z[i] = depth[v, u]
-        if z[i] == 0.0:
+        if not 0.0 < depth[v, u] < math.inf:  # false for NaN, as some drivers mark what they could not read
             continue
+        z[i] = depth[v, u]
         low = high = z[i]
         for y in range(max(v - MISREGISTRATION_PX, 0), min(v + MISREGISTRATION_PX, height - 1) + 1):
             for x in range(max(u - MISREGISTRATION_PX, 0), min(u + MISREGISTRATION_PX, width - 1) + 1):
                 d = depth[y, x]
-                if d > 0.0:
+                if 0.0 < d < math.inf:
                     low, high = min(low, d), max(high, d)
         spread[i] = high - low
     return z, spread
