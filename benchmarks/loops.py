@@ -27,7 +27,7 @@ from lodelight.geometry.cameras import Camera
 from lodelight.io.sources import open_source
 from lodelight.mapping.pairs import Pair, PairConfig, verify_pair
 from lodelight.mapping.places import Places
-from lodelight.mapping.verification import Refusal, Verifier
+from lodelight.mapping.verification import Verifier
 from single_frames import ORB, Shot, map_of, shots
 
 SIGMA_PX = 0.8
@@ -95,7 +95,7 @@ def wrong_pairs(trial: Trial, config: PairConfig, count: int, rng: np.random.Gen
     for a, b in pairs.tolist():
         answer = verify_pair(trial.verifier, a, b, config)
         accepted += isinstance(answer, Pair)
-        inliers[answer.inliers if isinstance(answer, Refusal) else answer.strength] += 1
+        inliers[answer.inliers] += 1
         other_room += trial.room[a] != trial.room[b]
         if isinstance(answer, Pair):
             print(f"ACCEPTED: {a} {b} of {trial.names[trial.room[a]]}, {trial.names[trial.room[b]]}")

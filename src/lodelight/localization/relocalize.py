@@ -13,7 +13,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.localization.machine import Found
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
-from lodelight.mapping.verification import Location, Refusal, Verifier
+from lodelight.mapping.verification import Location, Refusal, Verifier, elsewhere
 from lodelight.types import Ints
 
 
@@ -24,6 +24,7 @@ class RelocalizerConfig:
     min_inliers, min_coverage : map points found, and share of the image's cells with points that have one found,
         below which an answer is not believed. Wrong places of real rooms reach 10 points once in 10,000 trials
         (docs/places-and-loops.md); a poster that hangs in two rooms reaches more, but in few cells.
+    rival : an answer elsewhere with so large a share of the best one's points makes it ambiguous
     hint_angle_deg : how far a keyframe's view may be turned from a hinted pose to be looked at
     """
 
@@ -31,6 +32,7 @@ class RelocalizerConfig:
     candidates: int = 5
     min_inliers: int = 30
     min_coverage: float = 0.35
+    rival: float = 0.5
     hint_angle_deg: float = 60.0
 
 
@@ -51,15 +53,18 @@ class Relocalizer:
         hint : a pose and how far off it may be, m; only keyframes from around there are then looked at
         """
         with self.map.lock:
-            candidates = self._candidates(seen, hint)
-            doubts = []
-            for keyframe in candidates.tolist():
+            doubts: list[str] = []
+            believed: list[tuple[int, Location]] = []
+            for keyframe in self._candidates(seen, hint).tolist():
                 found = self._verifier.locate(seen, keyframe, self._verifier.neighbourhood(keyframe))
                 doubt = found.why if isinstance(found, Refusal) else self._doubt(found)
                 if isinstance(found, Location) and not doubt:
-                    return self._answer(seen, keyframe, found)
+                    believed.append((keyframe, found))
                 doubts.append(f"most like keyframe {keyframe}, but {doubt}")
-            return doubts[0] if doubts else "no keyframe looks alike"
+            if not believed:
+                return doubts[0] if doubts else "no keyframe looks alike"
+            believed.sort(key=lambda answer: -len(answer[1]))
+            return self._rival(believed) or self._answer(seen, *believed[0])
 
     def _candidates(self, seen: Features, hint: tuple[SE3, float] | None) -> Ints:
         if hint is None:
@@ -84,6 +89,18 @@ class Relocalizer:
             return f"{len(found)} points found, {self.config.min_inliers} are needed"
         if found.coverage < self.config.min_coverage:
             return f"points found in {found.coverage:.0%} of the view, {self.config.min_coverage:.0%} are needed"
+        return ""
+
+    def _rival(self, believed: list[tuple[int, Location]]) -> str:
+        """Whether the second best answer is elsewhere and nearly as good; empty where it is not."""
+        (keyframe, best), *others = believed
+        for other_keyframe, other in others:
+            two_places = elsewhere(best.T_world_body, other.T_world_body)
+            if two_places and len(other) > self.config.rival * len(best):
+                return (
+                    f"keyframes {keyframe} and {other_keyframe} both fit, with {len(best)} and {len(other)} points, "
+                    "in different places"
+                )
         return ""
 
     def _answer(self, seen: Features, keyframe: int, found: Location) -> Found:

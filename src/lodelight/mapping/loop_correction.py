@@ -77,7 +77,7 @@ def _spread_error(map: Map, loop: Pair, sigma_rad: float) -> float:
     closed = np.flatnonzero(map.keyframes.alive[map.loops.a] & map.keyframes.alive[map.loops.b])
     a = np.concatenate([a, row[map.loops.a[closed]], row[[loop.a]]])
     b = np.concatenate([b, row[map.loops.b[closed]], row[[loop.b]]])
-    n_shared = np.concatenate([n_shared, np.full(len(closed) + 1, loop.strength)])
+    n_shared = np.concatenate([n_shared, np.full(len(closed) + 1, loop.inliers)])
     depth_m = np.array([_median_distance(map, int(k)) for k in keyframes])
     graph = PoseGraph(
         R, p, map.keyframes.parent[keyframes] < 0, a, b,

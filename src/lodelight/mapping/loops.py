@@ -15,12 +15,12 @@ import numpy as np
 
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
-from lodelight.geometry.so3 import rotation_angle
+from lodelight.mapping.drift import path_between
 from lodelight.mapping.loop_correction import Correction, correct_loop
 from lodelight.mapping.map import Map
 from lodelight.mapping.pairs import Pair, PairConfig, verify_pair
 from lodelight.mapping.places import Places
-from lodelight.mapping.verification import MIN_AGREEING, WINDOWS_PX, Refusal, Verifier
+from lodelight.mapping.verification import MIN_AGREEING, WINDOWS_PX, Verifier, elsewhere
 from lodelight.types import Ints
 
 EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
@@ -34,10 +34,12 @@ class LoopConfig:
     min_shared : keyframes that share so many points are neighbours, among which no loop is looked for
     candidates : places that are verified for each keyframe, most similar first
     min_similarity : of a place, as a share of the similarity to the least similar neighbour
+    rival : a place elsewhere with so large a share of the points makes a loop ambiguous
     strong_inliers : points found in both directions that need no second keyframe
     confirm_within : keyframes within which a second one must agree with a loop that is not strong
-    drift, drift_m, drift_deg : the estimate is off by no more than this share of the path, and of all turns, since
-        the place was mapped, plus this much
+    drift, drift_m, drift_deg : the estimate is off by no more than this share of the way between the two keyframes,
+        and of the turns on it, plus this much. Three times what stereo and RGB-D drift by; what looks the same every
+        few metres is kept apart by nothing else
     iterations : of the adjustment of the whole map after a loop
     """
 
@@ -46,9 +48,10 @@ class LoopConfig:
     candidates: int = 3
     min_similarity: float = 0.6
     pair: PairConfig = field(default_factory=PairConfig)
+    rival: float = 0.5
     strong_inliers: int = 60
     confirm_within: int = 3
-    drift: float = 0.05
+    drift: float = 0.03
     drift_m: float = 0.3
     drift_deg: float = 5.0
     iterations: int = 10
@@ -114,11 +117,20 @@ class LoopCloser:
     # -- belief -------------------------------------------------------------------------------------------------
 
     def _find(self, keyframe: int) -> Pair | None:
+        """The loop that is believed, if any, of all the places that look alike."""
+        possible: list[Pair] = []
         for candidate in self._candidates(keyframe).tolist():
-            loop = verify_pair(self.verifier, keyframe, candidate, self.config.pair)
-            doubt = loop.why if isinstance(loop, Refusal) else self._doubt(loop)
-            self._tell(keyframe, candidate, loop, doubt)
-            if isinstance(loop, Pair) and not doubt:
+            answer = verify_pair(self.verifier, keyframe, candidate, self.config.pair)
+            refused = self._too_far(answer) if isinstance(answer, Pair) else answer.why
+            if isinstance(answer, Pair) and not refused:
+                possible.append(answer)
+            else:
+                self._tell(keyframe, candidate, answer.inliers, refused)
+        possible.sort(key=lambda loop: -loop.inliers)
+        for loop in possible:
+            doubt = self._ambiguous(loop, possible) or self._unconfirmed(loop)
+            self._tell(keyframe, loop.b, loop.inliers, doubt)
+            if not doubt:
                 self._awaiting.clear()
                 return loop
         return None
@@ -135,32 +147,10 @@ class LoopCloser:
             min_score=self.config.min_similarity * float(score[neighbours].min()),
         )  # fmt: skip
 
-    def _doubt(self, loop: Pair) -> str:
-        """Why a verified loop is not to be believed, or not yet; empty where it is."""
-        T_world_a = self.map.pose(loop.b) @ loop.T_a_b.inverse()
-        why = self._too_far(loop, T_world_a)
-        if why or loop.strength >= self.config.strong_inliers:
-            return why
-        place = self.verifier.neighbourhood(loop.b)
-        seen = self.map.features_of(loop.a)
-        for other in self._awaiting:
-            expected = other.T_new_old @ self.map.pose(loop.a)
-            agreement = self.verifier.explained(loop.there, seen, expected)
-            if np.isin(place, other.place).any() and agreement >= self.config.pair.min_agreement:
-                return ""
-        self._awaiting.append(_Awaiting(loop.a, place, T_world_a @ self.map.pose(loop.a).inverse()))
-        return f"{loop.strength} points found; a second keyframe must agree"
-
-    def _too_far(self, loop: Pair, T_world_a: SE3) -> str:
-        """Why the estimate cannot have drifted from T_world_a to where it is; empty where it can."""
-        k = self.map.keyframes
-        since, until = sorted((int(k.t_ns[loop.a]), int(k.t_ns[loop.b])))
-        path = np.flatnonzero(k.alive & (k.t_ns >= since) & (k.t_ns <= until))
-        path = path[np.argsort(k.t_ns[path], kind="stable")]
-        length_m = float(np.linalg.norm(np.diff(k.p[path], axis=0), axis=1).sum())
-        steps = k.R[path[:-1]].transpose(0, 2, 1) @ k.R[path[1:]]
-        turns_deg = float(np.degrees([rotation_angle(np.ascontiguousarray(R)) for R in steps]).sum())
-        T_old_new = self.map.pose(loop.a).inverse() @ T_world_a
+    def _too_far(self, loop: Pair) -> str:
+        """Why the estimate cannot have drifted as far as the loop says; empty where it can."""
+        length_m, turns_deg = path_between(self.map, loop.a, loop.b)
+        T_old_new = self.map.pose(loop.a).inverse() @ self._where(loop)
         moved_m, turned_deg = float(np.linalg.norm(T_old_new.t)), math.degrees(T_old_new.angle)
         config = self.config
         most_m, most_deg = config.drift_m + config.drift * length_m, config.drift_deg + config.drift * turns_deg
@@ -171,15 +161,40 @@ class LoopCloser:
             f"drift explains {most_m:.2f} m and {most_deg:.1f} deg"
         )
 
+    def _ambiguous(self, loop: Pair, possible: list[Pair]) -> str:
+        """Which other place fits nearly as well; empty where none does."""
+        for other in possible:
+            two_places = elsewhere(self._where(loop), self._where(other))
+            if two_places and other.inliers > self.config.rival * loop.inliers:
+                return f"keyframe {other.b} fits too, with {other.inliers} points to {loop.inliers}"
+        return ""
+
+    def _unconfirmed(self, loop: Pair) -> str:
+        """Why a loop must wait for a second keyframe; empty where it is strong, or the second one."""
+        if loop.inliers >= self.config.strong_inliers:
+            return ""
+        place, seen = self.verifier.neighbourhood(loop.b), self.map.features_of(loop.a)
+        for first in self._awaiting:
+            expected = first.T_new_old @ self.map.pose(loop.a)
+            agreement = self.verifier.explained(loop.there, seen, expected)
+            same_place = first.keyframe != loop.a and np.isin(place, first.place).any()
+            if same_place and agreement >= self.config.pair.min_agreement:
+                return ""
+        self._awaiting.append(_Awaiting(loop.a, place, self._where(loop) @ self.map.pose(loop.a).inverse()))
+        return f"{loop.inliers} points found; a second keyframe must agree"
+
+    def _where(self, loop: Pair) -> SE3:
+        """T_world_body of keyframe a as the loop has it."""
+        return self.map.pose(loop.b) @ loop.T_a_b.inverse()
+
     def _drifted(self, loop: Pair) -> bool:
         """Whether the map's own poses put the points elsewhere than where they were found."""
         seen = self.map.features_of(loop.a)
         agreement = self.verifier.explained(loop.there, seen, self.map.pose(loop.a), WINDOWS_PX[-1])
         return agreement < self.config.pair.min_agreement
 
-    def _tell(self, a: int, b: int, loop: Pair | Refusal, doubt: str) -> None:
+    def _tell(self, a: int, b: int, inliers: int, doubt: str) -> None:
         """Emit what was decided, where there was anything to decide: images that only look alike share no pose."""
-        inliers = loop.strength if isinstance(loop, Pair) else loop.inliers
         if inliers >= MIN_AGREEING:
             t_ns = int(self.map.keyframes.t_ns[a])
             self.emit(t_ns, "loop", accepted=not doubt, why=doubt, keyframe=a, place=b, inliers=inliers)

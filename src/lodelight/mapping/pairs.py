@@ -37,7 +37,7 @@ class Pair:
     back: Location
 
     @property
-    def strength(self) -> int:
+    def inliers(self) -> int:
         """Inliers of the weaker direction."""
         return min(len(self.there), len(self.back))
 

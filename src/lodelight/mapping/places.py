@@ -15,9 +15,8 @@ from lodelight.mapping.vocabulary import Vocabulary
 from lodelight.types import AnyArray, ArrayF32, Bools, Ints, Words
 
 COMMON_WORDS = 0.8  # of the most that any keyframe shares: fewer, and it is no candidate
-GROUP_SIZE = 10  # covisible keyframes whose scores a candidate adds to its own
-GROUP_SCORE = 0.75  # of the best group's score: lower, and the group is no candidate
-GROUPS_LOOKED_AT = 15  # the most similar: a bound on the time of a query, above what the rules above mostly leave
+PLACE_SIZE = 10  # covisible keyframes that make one place with a keyframe, and add their scores to its own
+LOOKED_AT = 15  # keyframes, the most similar: a bound on the time of a query
 
 
 @kernel
@@ -149,16 +148,21 @@ class Places:
         most = common[allowed].max(initial=0)
         similar: Bools = allowed & (common > 0) & (common >= COMMON_WORDS * most) & (score >= min_score)
         chosen = np.flatnonzero(similar)
-        chosen = chosen[np.argsort(-score[chosen], kind="stable")][:GROUPS_LOOKED_AT]
-        groups = [self._group(int(k), score, similar) for k in chosen]
-        return _best_of_groups(groups, limit)
+        chosen = chosen[np.argsort(-score[chosen], kind="stable")][:LOOKED_AT]
+        return self._best_of_places(chosen, score, similar, limit)
 
-    def _group(self, keyframe: int, score: ArrayF32, similar: Bools) -> tuple[float, int]:
-        """Score of a keyframe together with its covisible ones, and the best of them."""
-        around, _ = self.map.covisible(keyframe)
-        members = np.sort(np.append(around[:GROUP_SIZE], keyframe))
-        members = members[similar[members]]
-        return float(score[members].sum()), int(members[np.argmax(score[members])])
+    def _best_of_places(self, chosen: AnyArray, score: ArrayF32, similar: Bools, limit: int) -> Ints:
+        """Of keyframes, best first, those that no better one is covisible with, by the score of all that are."""
+        claimed = np.zeros(len(score), np.bool_)
+        places: list[tuple[float, int]] = []
+        for keyframe in chosen.tolist():
+            if not claimed[keyframe]:
+                around, _ = self.map.covisible(keyframe)
+                members = np.append(keyframe, around[:PLACE_SIZE])
+                claimed[members] = True
+                places.append((float(score[members[similar[members]]].sum()), keyframe))
+        places.sort(key=lambda place: -place[0])
+        return np.array([keyframe for _, keyframe in places[:limit]], np.int32)
 
     def _desc(self, keyframe: int) -> Words:
         desc: Words = self.map.features.desc[self.map.feature_range(keyframe)]
@@ -177,12 +181,3 @@ def _grown(column: AnyArray, needed: int) -> AnyArray:
     out = np.zeros(max(needed, len(column) + len(column) // 4), column.dtype)
     out[: len(column)] = column
     return out
-
-
-def _best_of_groups(groups: list[tuple[float, int]], limit: int) -> Ints:
-    best = max((score for score, _ in groups), default=0.0)
-    kept: list[int] = []
-    for score, keyframe in sorted(groups, key=lambda g: (-g[0], g[1])):
-        if score >= GROUP_SCORE * best and keyframe not in kept:
-            kept.append(keyframe)
-    return np.array(kept[:limit], np.int32)

@@ -28,6 +28,7 @@ WINDOWS_PX = (10.0, 4.0)  # in which points are looked for, one after another, i
 WINDOW_HAMMING = 64
 PARALLAX = 0.25  # rad: how far apart two views are from which a descriptor still matches, for the most part
 MAX_DEPTH_SIGMA = 0.5  # of a depth: beyond, its uncertainty has no Gaussian shape any more
+ELSEWHERE_M, ELSEWHERE_DEG = 0.5, 10.0  # poses farther apart than a map is bent are of two places
 GRID = (8, 6)  # cells of the image over which the spread of inliers is counted
 
 
@@ -58,6 +59,12 @@ class Refusal:
 
     why: str
     inliers: int = 0
+
+
+def elsewhere(T_world_body: SE3, other: SE3) -> bool:
+    """Whether two answers to where an image was taken are two places, and not one in a map that is a little bent."""
+    apart = T_world_body.inverse() @ other
+    return bool(np.linalg.norm(apart.t) > ELSEWHERE_M or np.degrees(apart.angle) > ELSEWHERE_DEG)
 
 
 class Verifier:
