@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from conftest import shared_data
+from lodelight.estimation.pose import PoseResult
 from lodelight.evaluation.associate import matched
 from lodelight.evaluation.ate import ate
+from lodelight.geometry.se3 import SE3
 from lodelight.io import open_source
 from lodelight.mapping.invariants import problems
 from lodelight.mapping.store import load_map, save_map
@@ -161,3 +163,20 @@ def test_without_depth_no_map_is_begun_and_the_reason_is_told():
     estimate = Slam(recording.rig).feed(blind)
     assert estimate.status == "initializing"
     assert "0 of" in estimate.why
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0, 4.0])
+def test_matches_that_agree_by_chance_are_no_evidence_of_a_pose(noise):
+    recording, _ = frames_of("tum_fr1_rpy")
+    tracker, rng = Slam(recording.rig).tracker, np.random.default_rng(0)
+    bound_px, window_px = np.sqrt(5.991) * noise, tracker.config.search_px  # 95 % of two normal numbers
+
+    def count(agree):
+        solved = PoseResult(SE3.identity(), np.eye(6), agree, np.zeros(len(agree)))
+        return tracker._right(solved, noise, window_px)
+
+    wrong = [window_px * np.sqrt(rng.random(40)) < bound_px for _ in range(300)]  # anywhere in the window
+    right = [np.linalg.norm(rng.normal(0, noise, (200, 2)), axis=1) < bound_px for _ in range(300)]
+    assert np.mean([count(w) for w in wrong]) < 1
+    assert max(count(w) for w in wrong) < tracker.config.min_matches
+    assert min(count(r) for r in right) > 0.6 * 200

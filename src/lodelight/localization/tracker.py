@@ -25,6 +25,7 @@ CLOSE_SIGMA = 0.05  # of a depth, as a share of it, up to which a point is put t
 MEDIAN_CHI2_2, MEDIAN_CHI2_3 = 1.386, 2.366  # of a chi-square distribution with 2 and 3 degrees of freedom
 SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it counts as sharp; more is a failure
 INLIERS = 0.95  # of right matches, which pass their test
+CHANCE_SIGMA = 3.0  # of the binomial distribution of those that agree by chance: so many are put down to it
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
 
 
@@ -80,7 +81,7 @@ class Landmarks:
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A pose from matches. point : (N,) map point of every feature that agrees, or -1; tried : matches there were;
-    right : how many of them are, going by how many more agree than would by chance
+    right : how many of them are at least, going by how many more agree than would by chance
     """
 
     solved: PoseResult
@@ -239,15 +240,16 @@ class Tracker:
         return fit.right >= max(self.config.min_matches, MAJORITY * fit.tried)
 
     def _right(self, solved: PoseResult, noise: float, search_px: float) -> float:
-        """How many matches are right, going by how many more are inliers than would be if none were.
+        """How many matches are right at least, going by how many more are inliers than would be if none were.
 
         A wrong match lies anywhere in the window it was looked for in, so it passes for an inlier as often as the
         bound's share of that window is large. Where a frame is noisy, that is often: there a wrong pose gathers as
         many inliers in its windows as the right one, and only matches from the whole image tell them apart.
         """
         chance = min(CHI2_PX * (noise * self.config.sigma_px / search_px) ** 2, INLIERS)
-        excess = solved.n_inliers - chance * len(solved.inliers)
-        return excess / (INLIERS - chance) if chance < INLIERS else 0.0
+        n = len(solved.inliers)
+        excess = solved.n_inliers - chance * n - CHANCE_SIGMA * math.sqrt(chance * (1.0 - chance) * n)
+        return max(excess, 0.0) / (INLIERS - chance) if chance < INLIERS else 0.0
 
     def _solve(self, start: SE3, seen: Features, xyz: Array) -> tuple[PoseResult, float]:
         """Motion-only optimization of features against world positions (N, 3), and by how much this frame's noise
