@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from conftest import shared_data
@@ -306,6 +306,7 @@ def test_what_is_no_calibration_is_told(tmp_path, text):
         load_rig(tmp_path / "a.yaml")
 
 
+@example(at=368, junk=";")  # leaves 8.121e-0; which YAML takes for a number and cannot read
 @given(st.integers(0, len(CAMCHAIN)), st.text(max_size=5))
 def test_a_damaged_file_is_a_rig_or_one_clear_error(tmp_path_factory, at, junk):
     path = tmp_path_factory.mktemp("rig") / "chain.yaml"

@@ -39,7 +39,7 @@ def read_yaml(path: Path) -> Section:
     text = re.sub(r"\A\s*%YAML[^\n]*\n(---)?", "", read_text(path))
     try:
         data = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: what looked like a number or a date is none
         line = (
             f" line {error.problem_mark.line + 1}"
             if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark
