@@ -36,3 +36,23 @@ def test_the_scale_of_a_stereo_map_is_that_of_the_building(demo):
         / np.linalg.norm(np.diff(estimate.xyz[::10], axis=0), axis=1).sum()
     )
     assert ratio == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("sensors", ["rgbd", "stereo"])
+def test_errors_are_of_the_size_that_covariances_say(demo, sensors):
+    from lodelight.evaluation.associate import matched
+    from lodelight.evaluation.nees import nees
+    from lodelight.io import open_source
+    from lodelight.io.covariances import read_covariances
+    from lodelight.io.trajectories import read_trajectory
+    from lodelight.trajectory import Trajectory
+
+    live = read_trajectory(demo / sensors / "trajectory_live.tum")
+    estimate, truth = matched(live, open_source(demo / "office").ground_truth())
+    # the map's origin is its first keyframe, whose pose is exact by definition
+    T_map_world = estimate.pose(0) @ truth.pose(0).inverse()
+    aligned = Trajectory.from_poses(truth.t_ns.tolist(), [T_map_world @ truth.pose(i) for i in range(len(truth))])
+    _, covariance = read_covariances(demo / sensors / "covariance.csv")
+    result = nees(estimate, aligned, covariance)
+    # one path of one building: errors of a drifting map are one draw, not many
+    assert 0.02 < result.pose < 4.0

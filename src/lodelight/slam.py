@@ -14,7 +14,7 @@ from lodelight.errors import ConfigError
 from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
-from lodelight.geometry.se3 import SE3
+from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording
 from lodelight.localization.machine import LocalizationMachine
@@ -234,8 +234,14 @@ class Slam:
             queue=self.mapping.queued,
         )
 
+    def _covariance(self, tracked: Tracked) -> Array:
+        """Of the pose against the map's root: its own against the map there, and what the map there carries."""
+        reference = tracked.reference
+        known: Array = self.map.keyframes.covariance[reference]
+        return tracked.covariance + carried_covariance(self.map.pose(reference), known, tracked.T_world_body)
+
     def _estimate(self, tracked: Tracked, clock: Stopwatch) -> Estimate:
-        covariance = LOST_COVARIANCE if tracked.why_lost else tracked.covariance
+        covariance = LOST_COVARIANCE if tracked.why_lost else self._covariance(tracked)
         return Estimate(
             tracked.t_ns, self.machine.status, tracked.T_world_body, covariance, self.machine.why,
             tracked.n_inliers, {"track_ms": clock.ms()},

@@ -15,6 +15,7 @@ from lodelight.geometry.so3 import (
     matrix_from_quat_wxyz,
     quat_wxyz_from_matrix,
     rotation_angle,
+    skew,
     so3_exp,
     so3_log,
 )
@@ -95,3 +96,16 @@ class SE3:
         """From self at u = 0 to other at u = 1: slerp and lerp."""
         w = so3_log(np.ascontiguousarray(self.R.T @ other.R))
         return SE3(self.R @ so3_exp(u * w), (1.0 - u) * self.t + u * other.t)
+
+
+def carried_covariance(T_world_a: SE3, covariance_a: Array, T_world_b: SE3) -> Array:
+    """(6, 6) covariance of a pose b that is fixed to a pose a, both in the chart of SE3.perturbed.
+
+    A turn of a turns b as much and moves it on the arm between them: R_b^T R_a dtheta, dp - R_a [t_ab]x dtheta.
+    """
+    T_a_b = T_world_a.inverse() @ T_world_b
+    J = np.eye(6)
+    J[:3, :3] = T_a_b.R.T
+    J[3:, :3] = -T_world_a.R @ skew(T_a_b.t)
+    carried: Array = J @ covariance_a @ J.T
+    return carried

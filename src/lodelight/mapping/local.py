@@ -19,7 +19,7 @@ from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
 from lodelight.features.matching import FeatureIndex
 from lodelight.features.orb import OrbConfig
-from lodelight.geometry.se3 import SE3
+from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.geometry.triangulate import triangulate_pairs
 from lodelight.mapping import kernels
 from lodelight.mapping.map import Map
@@ -164,7 +164,7 @@ class LocalMapper:
         with map.lock:
             neighbours, _ = map.covisible(keyframe, self.config.min_shared)
         window = np.append(neighbours[: self.config.window - 1], keyframe).astype(np.int32)
-        adjust(map, window, self.orb, self.config.sigma_px, self.config.iterations, stop)
+        adjust(map, window, self.orb, self.config.sigma_px, self.config.iterations, stop, newest=keyframe)
 
     def _cull_keyframes(self, keyframe: int) -> None:
         map, kf = self.map, self.map.keyframes
@@ -224,14 +224,26 @@ def fuse_into(map: Map, keyframe: int, points: Ints, orb: OrbConfig, radius_px: 
 
 
 def adjust(
-    map: Map, window: Ints, orb: OrbConfig, sigma_px: float, iterations: int, stop: Callable[[], bool] | None
+    map: Map,
+    window: Ints,
+    orb: OrbConfig,
+    sigma_px: float,
+    iterations: int,
+    stop: Callable[[], bool] | None,
+    newest: int | None = None,
 ) -> None:
-    """Bundle adjustment of `window` keyframes and what they see; observations that do not fit are unlinked."""
+    """Bundle adjustment of `window` keyframes and what they see; observations that do not fit are unlinked.
+
+    newest : keyframe whose covariance is found as well
+    """
     with map.lock:
         problem, keyframes, points, rows = bundle_of(map, window, orb, sigma_px)
-    result = bundle_adjust(problem, iterations=iterations, stop=stop)
+    wanted = [] if newest is None else [int(np.searchsorted(keyframes, newest))]
+    result = bundle_adjust(problem, iterations=iterations, stop=stop, covariance_of=wanted)
     with map.lock:
         commit_bundle(map, result.R, result.p, result.xyz, problem.fixed, keyframes, points)
+        if newest is not None:
+            _set_covariance(map, newest, result.covariance[0], problem, keyframes)
         still = map.features.point[rows] == points[problem.point]
         map.unlink(rows[~result.inliers & still])
         map.refresh_points(points[map.points.alive[points]], orb.scale_factor, orb.n_levels)
@@ -265,6 +277,17 @@ def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[
         weight=map.keyframes.weight[observer],
     )
     return problem, keyframes, points, rows
+
+
+def _set_covariance(map: Map, keyframe: int, relative: Array, problem: BundleProblem, keyframes: Ints) -> None:
+    """The adjustment's covariance is against the poses it held fixed: add what the one with most ties to it carries."""
+    held = np.flatnonzero(problem.fixed)
+    total = relative
+    if len(held):
+        ties = np.bincount(problem.keyframe, minlength=len(keyframes))[held]
+        anchor = int(keyframes[held[np.argmax(ties)]])
+        total = relative + carried_covariance(map.pose(anchor), map.keyframes.covariance[anchor], map.pose(keyframe))
+    map.keyframes.covariance[keyframe] = total
 
 
 def commit_bundle(map: Map, R: Array, p: Array, xyz: Array, fixed: Bools, keyframes: Ints, points: AnyArray) -> None:

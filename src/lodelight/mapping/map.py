@@ -25,8 +25,8 @@ class Map:
     """Everything a system knows of a building.
 
     keyframes : t_ns, R (3, 3) and p (3,) m of T_world_body (of T_parent_body once it is culled), weight,
-                noise (sigma of its corners over a sharp frame's), parent (spanning tree, -1 = root), first_feature,
-                n_features, alive
+                noise (sigma of its corners over a sharp frame's), covariance (6, 6) of the pose against the
+                root's, chart of SE3.perturbed, parent (spanning tree, -1 = root), first_feature, n_features, alive
     features  : keyframe, px (2,), octave, angle, desc (4,), inv_depth, sigma_inv_depth, point (-1 = none),
                 next (the next feature of the same point, -1 = last)
     points    : xyz (3,) m world, desc (4,), normal (3,) mean viewing direction, d_min, d_max m (where its scale can
@@ -40,7 +40,7 @@ class Map:
         self.rig = rig
         self.lock = threading.RLock()
         self.keyframes = Table(
-            t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), noise=(f64, ()), parent=(i32, ()),
+            t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), noise=(f64, ()), covariance=(f64, (6, 6)), parent=(i32, ()),
             first_feature=(i32, ()), n_features=(i32, ()), alive=(np.bool_, ()),
         )  # fmt: skip
         self.features = Table(
