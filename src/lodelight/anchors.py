@@ -43,7 +43,11 @@ class Tag:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A ceiling light that blinks at a frequency of its own: a disc of `radius_m` that shines along `normal`."""
+    """A coded ceiling light: a disc of `radius_m` that shines along `normal`.
+
+    It blinks at a frequency of its own; or, where it has a `word` of bits ("01101001"), says that in Manchester code
+    with `frequency_hz` half bits a second.
+    """
 
     id: str
     frequency_hz: float
@@ -51,6 +55,7 @@ class Light:
     normal: Array = field(default_factory=lambda: np.array([0.0, 0.0, -1.0]))
     radius_m: float = 0.09
     sigma_m: float = 0.005
+    word: str = ""
 
 
 @dataclass(frozen=True, eq=False)

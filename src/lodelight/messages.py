@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from lodelight.geometry.se3 import SE3
 from lodelight.types import Array, ArrayF32, Bytes
 
@@ -31,6 +33,55 @@ class Frame:
     t_ns: int
     images: tuple[Bytes, ...]
     depth: ArrayF32 | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LightSighting:
+    """A spot in an image of the light camera.
+
+    t_ns : when the row of its centre was exposed; centre_px (2,) (u, v), covariance_px (2, 2)
+    candidates : ids of the lights that have its code, none where it is unknown, and then `why` says the reason
+    frequency_hz 0 : no stripes; clear : enough of them, and nothing else
+    edges (N, 2) px : of its outline; box_px : left, top, width, height
+    """
+
+    t_ns: int
+    centre_px: Array
+    covariance_px: Array
+    diameter_rows: float
+    frequency_hz: float = 0.0
+    sigma_hz: float = float("inf")
+    candidates: tuple[str, ...] = ()
+    confidence: float = 0.0
+    why: str = ""
+    clear: bool = False
+    edges: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    box_px: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+    @property
+    def id(self) -> str | None:
+        """Its light, where only one has its code."""
+        return self.candidates[0] if len(self.candidates) == 1 else None
+
+    @property
+    def sigma_px(self) -> float:
+        """Of the centre, the mean of both axes."""
+        return float(np.sqrt(0.5 * np.trace(self.covariance_px)))
+
+
+@dataclass(frozen=True, eq=False)
+class LightFix:
+    """Where the body was by the lights alone; covariance as in `Estimate`.
+
+    lights : ids, of the sightings used; rms_px : of their reprojection; T_world_body None: abstained, `why` says it
+    """
+
+    t_ns: int
+    T_world_body: SE3 | None
+    covariance: Array
+    lights: tuple[str, ...] = ()
+    rms_px: float = 0.0
+    why: str = ""
 
 
 Message: TypeAlias = Imu | Frame

@@ -21,8 +21,9 @@ else:
     import tomli as tomllib
 
 PAYLOAD_HEAD = "LODE1"
+MAX_WORD = 32
 TAG_KEYS = {"family", "id", "size_m", "xyz", "quat_xyzw", "sigma_m"}
-LIGHT_KEYS = {"id", "frequency_hz", "xyz", "normal", "radius_m", "sigma_m"}
+LIGHT_KEYS = {"id", "frequency_hz", "xyz", "normal", "radius_m", "sigma_m", "word"}
 
 
 def read_anchors(path: str | Path) -> Anchors:
@@ -60,6 +61,7 @@ def write_anchors(path: str | Path, anchors: Anchors) -> None:
             "radius_m": light.radius_m,
             "sigma_m": light.sigma_m,
         }
+        | ({"word": light.word} if light.word else {})
         for light in anchors.lights
     ]
     write_text(Path(path), tomli_w.dumps({"tag": tags, "light": lights}))
@@ -132,7 +134,15 @@ def _light(entry: dict[str, Any], where: str) -> Light:
         normal / length,
         _positive(full, "radius_m", where),
         _positive(full, "sigma_m", where),
+        _word(entry, where),
     )
+
+
+def _word(entry: dict[str, Any], where: str) -> str:
+    word = entry.get("word", "")
+    if not isinstance(word, str) or set(word) - {"0", "1"} or len(word) > MAX_WORD:
+        raise SourceError(f'{where}: word must be up to {MAX_WORD} bits in quotes, as "01101001", got {word!r}')
+    return word
 
 
 def _check_keys(entry: dict[str, Any], known: set[str], needed: set[str], where: str) -> None:
