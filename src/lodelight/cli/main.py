@@ -25,6 +25,10 @@ COMMANDS = {
     "run": ("lodelight.cli.run", "SLAM over a recording: trajectory, map and report."),
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),
     "eval": ("lodelight.cli.evaluate", "Compare a trajectory with the truth: ATE, RPE, coverage, NEES."),
+    "lights": (
+        "lodelight.cli.lights",
+        "Visible light positioning: decode coded lights, plan their frequencies, calibrate the camera.",
+    ),
     "map": ("lodelight.cli.map", "Inspect, check and export saved maps."),
     "bench": ("lodelight.cli.bench", "Time and error over recordings on this machine: medians and ranges."),
 }

@@ -51,6 +51,7 @@ def open_euroc(path: Path, rig: Rig | None) -> ListedRecording:
         readings = _Images.read(mav / "depth0")
         depth, bad = first.paired(readings, round(-offset_s * NS_PER_S)), bad + readings.bad
     imu_file = mav / "imu0" / "data.csv"
+    lights = _Images.read(mav / "light0") if (mav / "light0" / "data.csv").is_file() else None
     return ListedRecording(
         path,
         FORMAT,
@@ -58,6 +59,7 @@ def open_euroc(path: Path, rig: Rig | None) -> ListedRecording:
         Listing(first.t_ns, tuple(images), depth, bad),
         imu=ImuTable.read(imu_file) if imu_file.is_file() else None,
         truth=lambda: _truth(path),
+        lights=None if lights is None else Listing(lights.t_ns, ([*lights.files],), bad=lights.bad),
     )
 
 

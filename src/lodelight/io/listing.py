@@ -73,6 +73,7 @@ class ListedRecording(Recording):
         listing: Listing,
         imu: ImuTable | None = None,
         truth: Callable[[], Trajectory | None] | None = None,
+        lights: Listing | None = None,
     ) -> None:
         """Keeps of the rig what the files serve. Raises SourceError on an empty list."""
         if not len(listing.t_ns):
@@ -84,8 +85,10 @@ class ListedRecording(Recording):
             cameras=cameras,
             depth=rig.depth if listing.depth is not None else None,
             imu=rig.imu if imu is not None else None,
+            lights=rig.lights if lights is not None else None,
         )
         super().__init__(path, format, rig, listing.bad + (imu.bad if imu else ()))
+        self._lights = lights
         self._listing = listing
         self._keep = increasing(listing.t_ns)
         self._imu_table = imu
@@ -117,6 +120,14 @@ class ListedRecording(Recording):
         for i, t_ns in enumerate(self._listing.t_ns.tolist()):
             path = self._listing.images[0][i]
             yield Shot(t_ns, str(path), partial(self._load, i, cameras, depth))
+
+    def light_shots(self) -> Iterator[Shot]:
+        if self._lights is None or self.rig.lights is None:
+            return
+        lens = self.rig.lights.camera
+        keep = increasing(self._lights.t_ns)
+        for t_ns, path, good in zip(self._lights.t_ns.tolist(), self._lights.images[0], keep.tolist(), strict=True):
+            yield Shot(t_ns, str(path), partial(_light_frame, t_ns, path, (lens.width, lens.height), good))
 
     def _load(self, i: int, cameras: int, depth: bool) -> Frame:
         listing = self._listing
@@ -167,6 +178,13 @@ class ListedRecording(Recording):
             return self._depth_reader.median_m(self._raw_depth(i))
         except BadFrame:
             return None
+
+
+def _light_frame(t_ns: int, path: Path | None, size: tuple[int, int], in_order: bool) -> Frame:
+    if not in_order:
+        raise BadFrame("stamp is a duplicate or out of order")
+    assert path is not None
+    return Frame(t_ns, (read_grey(path, size),))
 
 
 def _with_rate(spec: CameraSpec, t_ns: NDArray[np.int64]) -> CameraSpec:

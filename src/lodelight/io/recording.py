@@ -80,6 +80,10 @@ class Recording(ABC):
         """All inertial samples, stamps increasing, on the recording's own IMU clock."""
         return iter(())
 
+    def light_shots(self) -> Iterator[Shot]:
+        """All images of the light camera, as `shots`; none where the recording has no such camera."""
+        return iter(())
+
     def ground_truth(self) -> Trajectory | None:
         """T_world_body where the recording has it; for evaluation alone."""
         return None
@@ -112,7 +116,19 @@ class Recording(ABC):
     ) -> Generator[Frame, None, None]:
         """The frames alone, with the images of that many cameras and with depth if asked; else as `messages`."""
         self.skipped = list(self._bad_rows)
-        return self._decoded(self.shots(cameras, depth), *self._window(start_s, end_s))
+        offset_ns = self._on_body_clock(0)
+        return self._decoded(self.shots(cameras, depth), *self._window(start_s, end_s), offset_ns)
+
+    def light_frames(self, start_s: float = 0.0, end_s: float = math.inf) -> Generator[Frame, None, None]:
+        """The light camera's images, one a frame, stamped when row 0 opened; else as `frames`.
+
+        Raises SourceError where there is none that can be used.
+        """
+        if self.rig.lights is None:
+            raise SourceError(f"{self.path} has no light camera; its rig has no [lights], or its folder no light0")
+        self.skipped = list(self._bad_rows)
+        offset_ns = round(self.rig.lights.time_offset_s * NS_PER_S)
+        return self._decoded(self.light_shots(), *self._window(start_s, end_s), offset_ns)
 
     def inertial(self, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Imu]:
         """The inertial samples alone, as `messages`."""
@@ -143,16 +159,20 @@ class Recording(ABC):
     def _on_body_clock(self, t_ns: int) -> int:
         return t_ns + round(self.rig.cameras[0].time_offset_s * NS_PER_S)
 
-    def _decoded(self, shots: Iterator[Shot], first: float, last: float) -> Generator[Frame, None, None]:
+    def _decoded(
+        self, shots: Iterator[Shot], first: float, last: float, offset_ns: int
+    ) -> Generator[Frame, None, None]:
+        """offset_ns : added to the shots' stamps, which puts them on the body's clock."""
+
         def load(shot: Shot) -> Frame | Skipped:
-            t_ns = self._on_body_clock(shot.t_ns)
+            t_ns = shot.t_ns + offset_ns
             try:
                 frame = shot.load()
             except BadFrame as bad:
                 return Skipped(t_ns, shot.where, str(bad))
             return Frame(t_ns, frame.images, frame.depth)
 
-        wanted = (shot for shot in shots if first <= self._on_body_clock(shot.t_ns) <= last)
+        wanted = (shot for shot in shots if first <= shot.t_ns + offset_ns <= last)
         usable = False
         with closing(prefetch(wanted, load)) as loaded:
             for item in loaded:
