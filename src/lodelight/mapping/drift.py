@@ -27,11 +27,11 @@ def path_between(map: Map, a: int, b: int) -> tuple[float, float]:
     step_m = np.maximum(np.linalg.norm(k.p[start] - k.p[end], axis=1), MIN_STEP_M)
     graph = coo_array((step_m, (start, end)), shape=(len(k), len(k))).tocsr()
     length_m, before = dijkstra(graph, directed=False, indices=a, return_predecessors=True)
-    turns_deg = 0.0
-    at = b
-    while at != a:
-        if before[at] < 0:
+    way = [b]
+    while way[-1] != a:
+        if before[way[-1]] < 0:
             return math.inf, math.inf
-        turns_deg += math.degrees((map.pose(int(before[at])).inverse() @ map.pose(at)).angle)
-        at = int(before[at])
-    return float(length_m[b]), turns_deg
+        way.append(int(before[way[-1]]))
+    R = k.R[way]
+    cosine = (np.einsum("nij,nij->n", R[1:], R[:-1]) - 1.0) / 2.0  # half the trace of R1^T R2, less a half
+    return float(length_m[b]), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)).sum()))
