@@ -1,6 +1,7 @@
 """Modulation and receiver, on simulated images and a real photo."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.lights.calibrate import calibrate_row_time
 from lodelight.lights.modulation import Manchester, Pwm, contrast, flicker, null_hz
+from lodelight.lights.odometry import LightOdometry
 from lodelight.lights.plan import colour, frequencies, plan_frequencies
 from lodelight.lights.receiver import receiver
 from lodelight.rig import CameraSpec
@@ -162,6 +164,13 @@ def test_the_lights_of_a_real_photo_are_named():
     seen = {s.id: s for s in receiver(spec, lights).sightings(image, 0) if s.id}
     for name in ("2500", "3500", "4000"):  # those the rig file says are seen
         assert seen[name].frequency_hz == pytest.approx(float(name), rel=0.01)
+    # The published map is one seen from below: as it stands it has the wrong hand
+    with pytest.raises(CalibrationError, match="mirror"):
+        LightOdometry(spec, lights, sigma_tilt_deg=2.0, sigma_floor_px=1.0).locate(list(seen.values()))
+    turned = tuple(replace(light, xyz=light.xyz * [-1, 1, 1]) for light in lights)
+    fix = LightOdometry(spec, turned, sigma_tilt_deg=2.0, sigma_floor_px=1.0).locate(list(seen.values()))
+    assert len(fix.lights) == 5
+    assert fix.rms_px < 6.0
 
 
 def test_a_plan_keeps_lights_of_one_frequency_apart_and_says_when_it_cannot():

@@ -12,7 +12,7 @@ from lodelight.anchors import Light
 from lodelight.errors import CalibrationError
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import skew, so3_log
-from lodelight.lights.positioning import CHI2_2_99, Solution, Views, solve
+from lodelight.lights.positioning import CHI2_2_99, Solution, Views, misfits, solve
 from lodelight.lights.two_lights import poses_from_two_lights
 from lodelight.messages import LightFix, LightSighting
 from lodelight.rig import CameraSpec
@@ -25,6 +25,7 @@ MEMORY_S = 2.0  # for how long the last fix tells lights of one code apart
 FASTEST_M_S, SLACK_M = 2.5, 0.5
 SPREAD_RATIO = 1.5  # by which the second assignment's lights must be farther apart than the first's
 TWIST_S = 0.35  # two fixes nearer in time than this tell how the body moves
+MIRRORED = "the lights fit one pose only when their map is mirrored"
 NS = 1e-9
 
 
@@ -59,7 +60,7 @@ class LightOdometry:
         solution, views, why = self._assigned(seen, t_ns, up_cam)
         if solution is None:
             named = [s.id for s in seen if s.id is not None]
-            if views is not None and len(views.lights) >= 3 and fits_mirrored(views):
+            if why == MIRRORED and self._last is None and len(named) == len(seen):
                 raise CalibrationError(
                     f"the map of lights is a mirror image: {', '.join(named)} fit only with one horizontal axis "
                     "reversed; a ceiling drawn as seen from below has x or y the wrong way round in anchors.toml"
@@ -82,9 +83,9 @@ class LightOdometry:
         else:
             self._twist = None
         self._last = (t_ns, T)
-        pixels = np.sqrt(solution.chi2 * views.sigma**2) * self.spec.camera.focal_px
+        pixels = misfits(solution.T_world_cam, views) * self.spec.camera.focal_px
         return LightFix(t_ns, T, A @ solution.covariance @ A.T, tuple(light.id for light in views.lights),
-                        float(np.sqrt(np.mean(pixels**2) / 2.0)))  # fmt: skip
+                        float(np.sqrt(np.mean(pixels**2))))  # fmt: skip
 
     def _views(self, seen: Sequence[LightSighting], lights: tuple[Light, ...], t_ns: int, up_cam: Array) -> Views:
         rays, _ = self.spec.camera.unproject(np.array([s.centre_px for s in seen]))
@@ -151,7 +152,7 @@ class LightOdometry:
     def _best(
         self, lights: list[Light | None], seen: Sequence[LightSighting], t_ns: int, up_cam: Array
     ) -> tuple[Solution | None, Views | None, str]:
-        """A pose of all, or of all but the one that fits least, if three remain."""
+        """A pose of all, or of all but those that fit least: one of four to six, two of seven to nine."""
         rows = [i for i, light in enumerate(lights) if light is not None]
         chosen = tuple(light for light in lights if light is not None)
         if len({light.id for light in chosen}) < len(chosen):
@@ -159,8 +160,11 @@ class LightOdometry:
         views = self._views([seen[i] for i in rows], chosen, t_ns, up_cam)
         whole = views
         solution = solve(views)
+        if len(chosen) >= 3 and (solution is None or not _fitting(solution)) and fits_mirrored(whole):
+            return None, whole, MIRRORED
+        spare = (len(chosen) - 1) // 3  # fewer agree by chance
         while solution is not None and not _fitting(solution):
-            if len(views.lights) <= 3:
+            if len(chosen) - len(views.lights) >= spare:
                 solution = None
                 break
             worst = int(np.argmax(solution.chi2))

@@ -24,7 +24,6 @@ from lodelight.types import Array
 
 HUBER = 2.0  # sigmas of one light's two coordinates
 CHI2_2_99 = 9.21
-CHI2_99 = {2: 9.21, 4: 13.28, 6: 16.81, 8: 20.09, 10: 23.21, 12: 26.22}
 STEPS = 20
 
 
@@ -123,16 +122,30 @@ def _unit_free(H: Array) -> Array:
     return out
 
 
+def misfits(T: SE3, views: Views) -> Array:
+    """(N,) distance between each light's expected and measured centre, normalized coordinates."""
+    out = np.empty(len(views.lights))
+    for i, light in enumerate(views.lights):
+        seen = T.perturbed(views.moved[i])
+        out[i] = np.linalg.norm(_misfit(seen, light, views.rays[i])[1])
+    return out
+
+
+def _misfit(seen: SE3, light: Light, ray: Array) -> tuple[Array, Array]:
+    """The light in the camera (3,), and where its ellipse is centred less where it was measured (2,)."""
+    X = seen.R.T @ (light.xyz - seen.t)
+    return X, conic_centre(image_of_disc(X, seen.R.T @ light.normal, light.radius_m)) - ray[:2]
+
+
 def _linearized(T: SE3, views: Views) -> tuple[Array, Array, float, Array, float] | None:
     """Normal matrix, gradient, robust cost, chi2 (N,) and tilt2 at a pose."""
     H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
     chi2 = np.empty(len(views.lights))
     for i, light in enumerate(views.lights):
         seen = T.perturbed(views.moved[i])
-        X = seen.R.T @ (light.xyz - seen.t)
+        X, r = _misfit(seen, light, views.rays[i])
         if X[2] < 0.05:
             return None
-        r = conic_centre(image_of_disc(X, seen.R.T @ light.normal, light.radius_m)) - views.rays[i, :2]
         E = np.array([[1.0, 0.0, -X[0] / X[2]], [0.0, 1.0, -X[1] / X[2]]]) / X[2]
         noise = views.sigma[i] ** 2 * np.eye(2) + light.sigma_m**2 * E @ E.T
         J = np.hstack([E @ skew(X), -E @ seen.R.T])
