@@ -18,6 +18,7 @@ from lodelight.types import Array
 HARMONICS = 3
 LARGEST_HARMONIC = 0.47  # of the row rate
 CANDIDATES = 3
+LEAST_POWER = 0.05  # of the highest peak's; lower ones are side lobes and noise
 DARK = 0.02  # of the brightest part of a face; what is darker says little
 
 
@@ -55,6 +56,7 @@ def estimate_tone(
         values, weights = _normalized(profile, envelope, window, noise)
     power = periodogram(detrended(values, weights), weights, lowest, step, count)
     inner = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])) + 1
+    inner = inner[power[inner] > LEAST_POWER * power[inner].max(initial=0.0)]
     best: Tone | None = None
     for k in inner[np.argsort(-power[inner], kind="stable")][:CANDIDATES].tolist():
         nu = lowest + k * step
