@@ -25,8 +25,6 @@ LAYERS = [
 ]
 # Below the estimators in the list, yet not for them: they may not import these.
 OUTSIDE = {"io", "sim", "evaluation", "report"}
-# The map file holds its rig in the text that rig files have.
-ALLOWED = {("mapping", "io")}
 ALLOWED = {("mapping", "io")}  # save that a map file holds its rig as the text of a rig.toml
 ESTIMATORS = {"localization", "mapping", "estimation", "features", "tags", "lights", "imu"}
 RANK = {name: len(LAYERS) - row for row, names in enumerate(LAYERS) for name in names}

@@ -73,7 +73,8 @@ class LightSighting:
 class LightFix:
     """Where the body was by the lights alone; covariance as in `Estimate`.
 
-    lights : ids, of the sightings used; rms_px : of the distances between seen and expected centres; T_world_body None: abstained, `why` says it
+    lights : ids, of the sightings used; rms_px : of the distances between seen and expected centres
+    T_world_body None: abstained, `why` says it
     """
 
     t_ns: int

@@ -19,7 +19,9 @@ def sim(
     standstill: float = typer.Option(0.0, help="Seconds at rest before moving off."),
     changed: bool = typer.Option(False, "--changed", help="Furniture moved, posters replaced, some lights out."),
     trajectory: Path | None = typer.Option(None, help="Fly this TUM or EuRoC trajectory instead."),
-    place: str | None = typer.Option(None, help="Where to fly it: auto, or x,y,z,yaw in m and degrees; default: as it is, auto with --imu."),
+    place: str | None = typer.Option(
+        None, help="Where to fly it: auto, or x,y,z,yaw in m and degrees; default: as it is, auto with --imu."
+    ),
     imu: Path | None = typer.Option(None, help="EuRoC csv of a real IMU of that trajectory, passed on unchanged."),
     imu_model: str = typer.Option("euroc", help="euroc, phone or perfect: noise of the simulated IMU."),
     rig: str | None = typer.Option(None, help="standard, camera, euroc, or a rig.toml."),

@@ -40,8 +40,9 @@ class Map:
         self.rig = rig
         self.lock = threading.RLock()
         self.keyframes = Table(
-            t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), noise=(f64, ()), covariance=(f64, (6, 6)), parent=(i32, ()),
-            first_feature=(i32, ()), n_features=(i32, ()), alive=(np.bool_, ()),
+            t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), noise=(f64, ()),
+            covariance=(f64, (6, 6)), parent=(i32, ()), first_feature=(i32, ()), n_features=(i32, ()),
+            alive=(np.bool_, ()),
         )  # fmt: skip
         self.features = Table(
             keyframe=(i32, ()), px=(f32, (2,)), octave=(i32, ()), angle=(f32, ()), desc=(u64, (4,)),
