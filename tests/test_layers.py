@@ -20,6 +20,7 @@ LAYERS = [
     ["rig", "anchors", "trajectory", "settings"],
     ["messages"],
     ["geometry"],
+    ["fiducials"],
     ["compiled", "types", "errors", "data"],
     ["freshness"],
 ]

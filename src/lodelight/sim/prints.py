@@ -8,6 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from lodelight.fiducials import fiducial_modules
 from lodelight.sim.textures import power_of_two
 from lodelight.types import Array, ArrayF32
 
@@ -72,15 +73,9 @@ def qr(payload: str) -> tuple[ArrayF32, float]:
     return _code(code.astype(float), QUIET_QR)
 
 
-FAMILIES = {"tag36h11": ("DICT_APRILTAG_36h11", 8), "aruco_4x4_50": ("DICT_4X4_50", 6)}
-
-
 def fiducial(family: str, number: int) -> tuple[ArrayF32, float]:
     """An AprilTag or ArUco marker, and its side with white border over that of the black one."""
-    name, modules = FAMILIES[family]
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-    image = cv2.aruco.generateImageMarker(dictionary, number, modules)
-    return _code((np.asarray(image) > 127).astype(float), QUIET_FIDUCIAL)
+    return _code(fiducial_modules(family, number).astype(float), QUIET_FIDUCIAL)
 
 
 def _write(image: Array, text: str, x: int, y: int, height_px: float, grey: float, thick: int = 1) -> None:
