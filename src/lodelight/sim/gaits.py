@@ -37,10 +37,10 @@ class Gait:
 
 
 GAITS: dict[str, Gait] = {
-    "cart": Gait(0.9, 0.5, 0.9),
-    "walk": Gait(1.0, 1.45, 0.7, 0.02, 0.018, 0.9, 1.0, (0.02, 0.02, 0.01, 4.0, 2.5, 0.8), (0.05, 0.4)),
-    "drone": Gait(1.1, 1.5, 0.9, shake=(0.05, 0.05, 0.16, 12.0, 2.0, 2.0), band_hz=(0.05, 0.5), bank=1.0),
-    "hand": Gait(0.45, 1.4, 0.6, 0.008, 0.01, 0.8, 0.6, (0.05, 0.05, 0.06, 12.0, 6.0, 4.0), (0.08, 0.7)),
+    "cart": Gait(0.9, 1.3, 0.9),
+    "walk": Gait(1.0, 1.45, 0.7, 0.015, 0.015, 0.9, 0.4, (0.02, 0.02, 0.01, 4.0, 2.0, 0.8), (0.05, 0.3)),
+    "drone": Gait(1.1, 1.5, 0.9, shake=(0.05, 0.05, 0.16, 12.0, 1.5, 1.5), band_hz=(0.05, 0.35), bank=0.8),
+    "hand": Gait(0.45, 1.4, 0.6, 0.006, 0.008, 0.8, 0.3, (0.05, 0.05, 0.05, 12.0, 4.0, 2.5), (0.06, 0.4)),
 }
 
 
@@ -150,10 +150,10 @@ def _wander(gait: Gait, t: Array, rng: np.random.Generator) -> Array:
 
 
 def _body_acceleration(xy: Array, yaw: Array) -> tuple[Array, Array]:
-    """Forward and left acceleration, m/s^2, smoothed over half a second as a flight controller would."""
+    """Forward and left acceleration, m/s^2, smoothed over a second as a flight controller would."""
     a = np.gradient(np.gradient(xy, KNOT_S, axis=0), KNOT_S, axis=0)
-    window = np.hanning(13)[1:-1]
-    pad = np.pad(a, ((5, 5), (0, 0)), mode="edge")
+    window = np.hanning(23)[1:-1]
+    pad = np.pad(a, ((10, 10), (0, 0)), mode="edge")
     a = np.stack([np.convolve(pad[:, k], window / window.sum(), mode="valid") for k in range(2)], axis=1)
     c, s = np.cos(yaw), np.sin(yaw)
     return c * a[:, 0] + s * a[:, 1], c * a[:, 1] - s * a[:, 0]
