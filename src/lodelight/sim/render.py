@@ -2,7 +2,7 @@
 
 The image is cut into tiles. For each, the tree gives the quads its rays may meet, near ones first, and every quad is
 tried on all rays of the tile at once, a loop the compiler turns into vector instructions. Where neighbouring pixels
-see different quads, four rays per pixel are averaged.
+see different quads, eight rays per pixel are averaged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lodelight.types import Array, ArrayF32, Bytes, Ints
 TILE = 16
 SIDE = TILE + 2  # with one pixel around it, to see where quads change
 CELL = SIDE * SIDE
-SUB = 4  # rays of a pixel on an edge
+SUB = 8  # rays of a pixel on an edge
 STACK = 96
 EDGE_SLACK_M = 2e-5  # quads reach this much over their edges, so that no ray slips between two neighbours
 F0, F1, NEAR = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
@@ -234,8 +234,10 @@ def _render(
     right, down = np.zeros((3, n), np.float32), np.zeros((3, n), np.float32)
     ray_quad, ray_row, edge = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     ray_best, value, distance = np.empty(n, np.float32), np.empty(n), np.empty(n)
-    # A rotated grid: four rays that share no row and no column
-    step_x, step_y = (-0.125, 0.375, -0.375, 0.125), (-0.375, -0.125, 0.125, 0.375)
+    mine, owner, share = np.empty(SUB, np.int32), np.empty(n, np.int32), np.empty(n)
+    # Eight queens: rays of a pixel that share no row, no column and no diagonal
+    step_x = (-0.4375, -0.3125, -0.1875, -0.0625, 0.0625, 0.1875, 0.3125, 0.4375)
+    step_y = (0.0625, 0.3125, -0.1875, 0.4375, -0.3125, -0.4375, 0.1875, -0.0625)
     for ty in range(0, h, TILE):
         for tx in range(0, w, TILE):
             apex = origin[min(ty + TILE // 2, h + 1)]
@@ -296,14 +298,25 @@ def _render(
             for k in range(count):
                 _try_quad(geometry[tried[k]], np.int64(tried[k]), apex, n, ray_o, ray_d, ray_best, ray_quad)
             n = 0
-            for j in range(SUB * edges):  # close the gaps of rays that meet nothing
-                if ray_quad[j] >= 0:
+            for e in range(edges):  # what a pixel sees of one quad is shaded once, where its rays meet it on average
+                i = edge[e]
+                for s in range(SUB):
+                    mine[s] = ray_quad[SUB * e + s]
+                for s in range(SUB):
+                    q = mine[s]
+                    if q < 0:
+                        continue
+                    rays_of_q, fx, fy = 0, 0.0, 0.0
+                    for other in range(s, SUB):
+                        if mine[other] == q:
+                            mine[other] = -1
+                            rays_of_q, fx, fy = rays_of_q + 1, fx + step_x[other], fy + step_y[other]
                     for k in range(3):
-                        ray_o[k, n], ray_d[k, n] = ray_o[k, j], ray_d[k, j]
-                        right[k, n], down[k, n] = right[k, j], down[k, j]
-                    i = edge[j // SUB]
-                    ray_quad[n], ray_row[n] = ray_quad[j], ty + i // SIDE - 1
-                    ray_best[n] = j // SUB
+                        right[k, n], down[k, n] = d[k, i + 1] - d[k, i], d[k, i + SIDE] - d[k, i]
+                        ray_d[k, n] = d[k, i] + (fx * right[k, n] + fy * down[k, n]) / rays_of_q
+                        ray_o[k, n] = o[k, i]
+                    ray_quad[n], ray_row[n] = q, ty + i // SIDE - 1
+                    owner[n], share[n] = i, rays_of_q / SUB
                     n += 1
             shade_rays(
                 np.int64(n), ray_quad, ray_row, ray_o, ray_d, right, down, apex,
@@ -312,5 +325,5 @@ def _render(
             for e in range(edges):
                 image[ty + edge[e] // SIDE - 1, tx + edge[e] % SIDE - 1] = 0.0
             for j in range(n):
-                i = edge[int(ray_best[j])]
-                image[ty + i // SIDE - 1, tx + i % SIDE - 1] += value[j] / SUB
+                i = owner[j]
+                image[ty + i // SIDE - 1, tx + i % SIDE - 1] += value[j] * share[j]

@@ -19,7 +19,7 @@ from lodelight.types import Array, ArrayF32, Bytes
 FULL_WELL_E = 20_000.0  # electrons that make 255 grey levels at gain 1: noise as in EuRoC, 1.3 levels at mid grey
 READ_NOISE_E = 30.0
 DARK_DN = 1.5  # the black level, so that read noise is not cut off at 0
-PSF_PX = 0.55  # standard deviation of the lens's blur, about that of the EuRoC cameras
+PSF_PX = 0.45  # standard deviation of the lens's blur: edges as steep as those of the EuRoC cameras
 CORNER_LOSS = 0.45  # of the light, in the corners
 SENSITIVITY = 0.385  # grey levels per cd/m^2 and ms at gain 1: f/2 and a 6 um pixel, about
 NORMALS = ndtri((np.arange(1 << 14) + 0.5) / (1 << 14)).astype(np.float32)
