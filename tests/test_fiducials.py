@@ -34,5 +34,5 @@ def test_every_family_has_codes_with_a_black_border(family):
 def test_what_is_not_printed_is_named():
     with pytest.raises(ConfigError, match="0 to 586, not 587"):
         fiducial_modules("tag36h11", 587)
-    with pytest.raises(ConfigError, match="tag36h10x.*aruco_4x4_50"):
+    with pytest.raises(ConfigError, match=r"tag36h10x.*aruco_4x4_50"):
         fiducial_modules("tag36h10x", 0)

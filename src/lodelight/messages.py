@@ -85,6 +85,37 @@ class LightFix:
     why: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class TagSighting:
+    """A printed code in an image of camera `camera` (its row in the rig), read and checked against its print.
+
+    id : as in `anchors.toml`: the number as text; of a QR code its id field, or the whole payload
+    corners_px (4, 2) px, in the order of `anchors.tag_corners`; sigma_px (4,) noise of each corner, per axis
+    size_m, T_world_tag : what a QR code says of itself, None where it does not; nobody has checked it
+    agreement : correlation of the image with the code as it is printed, 1 at best
+    """
+
+    t_ns: int
+    family: str
+    id: str
+    corners_px: Array
+    sigma_px: Array
+    camera: int = 0
+    size_m: float | None = None
+    T_world_tag: SE3 | None = None
+    agreement: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """Family and id in one, unique in a building."""
+        return f"{self.family} {self.id}"
+
+    @property
+    def side_px(self) -> float:
+        """The shortest side."""
+        return float(np.linalg.norm(np.roll(self.corners_px, -1, axis=0) - self.corners_px, axis=1).min())
+
+
 Message: TypeAlias = Imu | Frame
 
 

@@ -1,4 +1,4 @@
-"""`anchors.toml`, and the payload by which a QR code says where it hangs."""
+"""`anchors.toml`: what is known of the building."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-PAYLOAD_HEAD = "LODE1"
 MAX_WORD = 32
 TAG_KEYS = {"family", "id", "size_m", "xyz", "quat_xyzw", "sigma_m"}
 LIGHT_KEYS = {"id", "frequency_hz", "xyz", "normal", "radius_m", "sigma_m", "word"}
@@ -65,38 +64,6 @@ def write_anchors(path: str | Path, anchors: Anchors) -> None:
         for light in anchors.lights
     ]
     write_text(Path(path), tomli_w.dumps({"tag": tags, "light": lights}))
-
-
-def tag_payload(tag: Tag) -> str:
-    """`LODE1;id=A17;size=0.20[;xyz=...;quat=...]`: what a QR code carries so that it needs no survey file."""
-    text = f"{PAYLOAD_HEAD};id={tag.id};size={tag.size_m:.2f}"
-    if tag.T_world_tag is None:
-        return text
-    xyz = ",".join(f"{v:.3f}".rstrip("0").rstrip(".") for v in tag.T_world_tag.t + 0.0)
-    quat = ",".join(f"{v:.4f}".rstrip("0").rstrip(".") for v in tag.T_world_tag.quat_xyzw + 0.0)
-    return f"{text};xyz={xyz};quat={quat}"
-
-
-def tag_from_payload(payload: str) -> Tag | None:
-    """The tag a payload describes, or None where it is no payload of ours (any other QR code in the building).
-
-    Raises SourceError where it begins like one of ours and is broken.
-    """
-    head, *fields = payload.strip().split(";")
-    if head != PAYLOAD_HEAD:
-        return None
-    entry: dict[str, Any] = {"family": "qr"}
-    names = {"id": "id", "size": "size_m", "xyz": "xyz", "quat": "quat_xyzw"}
-    for text in fields:
-        key, _, value = text.partition("=")
-        if key not in names:
-            continue  # a later version may say more
-        try:
-            numbers = [float(v) for v in value.split(",")] if key != "id" else []
-        except ValueError:
-            raise SourceError(f"QR payload {payload!r}: {key} is not made of numbers") from None
-        entry[names[key]] = value if key == "id" else numbers[0] if key == "size" else numbers
-    return _tag(entry, f"QR payload {payload!r}")
 
 
 def _entries(tables: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lodelight.anchors import Anchors, Light, Tag
+from lodelight.anchors.payload import tag_payload
 from lodelight.errors import ConfigError
 from lodelight.geometry.se3 import SE3
-from lodelight.io.anchors_toml import tag_payload
 from lodelight.sim import prints
 from lodelight.sim.faults import Faults
 from lodelight.sim.materials import MATERIALS, Material, make

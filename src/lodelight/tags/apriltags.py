@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import threading
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ class Quad:
 _lock = threading.Lock()  # the library keeps its work area in the detector
 
 
-@lru_cache(maxsize=None)
+@cache
 def _detector(family: str) -> Any:
     """One detector per family and process, never torn down: two of a family, or one at exit, crash the interpreter."""
     from pupil_apriltags import Detector
