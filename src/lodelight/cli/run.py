@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from lodelight.cli.options import TOPIC_HELP
+
 if TYPE_CHECKING:
     from lodelight.io.recording import Recording
     from lodelight.mapping.map import Map
@@ -19,7 +21,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command(epilog="Example: lodelight run recordings/room --out out/room --sensors rgbd")
 def run(
-    source: Path = typer.Argument(..., help="Recording: EuRoC, TUM RGB-D, KITTI, 7-Scenes folder, images or video."),
+    source: Path = typer.Argument(..., help="EuRoC, TUM RGB-D, KITTI, 7-Scenes folder, ROS bag, images or video."),
     out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
     sensors: str = typer.Option("", help="stereo or rgbd; default: the most the source has."),
     rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
@@ -29,16 +31,18 @@ def run(
     end: float = typer.Option(float("inf"), help="Seconds after the first frame."),
     seed: int = typer.Option(0, help="Seed of every random draw."),
     settings: list[str] = typer.Option([], "--set", help="section.key=value, for example mapping.window=30."),
+    topic: list[str] = typer.Option([], "--topic", help=TOPIC_HELP),
     as_json: bool = typer.Option(False, "--json", help="Print metrics.json."),
 ) -> None:
     """SLAM over a recording: trajectory, map and report."""
     from lodelight.errors import RunError
+    from lodelight.io.rosbag_topics import parse_roles
     from lodelight.io.sources import open_source
     from lodelight.mapping.store import load_map
     from lodelight.settings import with_settings
     from lodelight.slam import SlamConfig
 
-    recording = open_source(source, rig)
+    recording = open_source(source, rig, parse_roles(topic))
     config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), settings)
     known = load_map(map_file) if map_file else None
     metrics = slam_to_folder(recording, out, config, known, live, start, end)

@@ -41,7 +41,7 @@ def load_rig(path: str | Path) -> Rig:
     if "cam0" in root:
         return kalibr_rig(path)
     if any(key in root for key in ("camera_matrix", "K", "k")):
-        return Rig((CameraSpec("cam0", _matrix_camera(root), SE3.identity()),))
+        return Rig((CameraSpec("cam0", matrix_camera(root), SE3.identity()),))
     raise CalibrationError(
         f"{path} is no calibration known here; expected rig.toml, an EuRoC sensor.yaml (T_BS), a Kalibr camchain "
         "(cam0), a ROS CameraInfo or an OpenCV calibration (camera_matrix)"
@@ -142,7 +142,7 @@ def _named_lens(section: Section, coefficients: str) -> Camera:
     return _create(section, _distortion_model(section), size, (fx, fy, cx, cy), distortion)
 
 
-def _matrix_camera(root: Section) -> Camera:
+def matrix_camera(root: Section) -> Camera:
     """A lens by its 3x3 matrix: files of ROS (CameraInfo, also printed as a message) and OpenCV."""
     width = "image_width" if "image_width" in root else "width"
     height = "image_height" if "image_height" in root else "height"

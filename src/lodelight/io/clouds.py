@@ -41,6 +41,17 @@ def write_pcd(path: str | Path, xyz: AnyArray, normal: AnyArray | None = None, *
     write_bytes(Path(path), text.encode("ascii") + rows.tobytes())
 
 
+def read_ply(path: str | Path) -> AnyArray:
+    """Points (N, 3) m of a PLY file. Raises SourceError where it is none, or has no x, y, z."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertex = PlyData.read(str(path))["vertex"].data
+        return np.column_stack([vertex[name] for name in "xyz"])
+    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError):
+        raise SourceError(f"{path} is no point cloud in PLY with x, y, z") from None
+
+
 def _rows(
     xyz: AnyArray, normal: AnyArray | None, normal_names: tuple[str, str, str], attributes: dict[str, AnyArray]
 ) -> AnyArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +11,25 @@ from pathlib import Path
 import numpy as np
 
 from lodelight.errors import SourceError
+from lodelight.io import rosbag
 from lodelight.io.calibrations import load_rig
+from lodelight.io.clouds import read_ply
 from lodelight.io.euroc_writer import TRUTH, append_image, append_imu, stored_depth, write_sensors
 from lodelight.io.recording import Recording
 from lodelight.io.rig_toml import write_rig
-from lodelight.io.sources import open_source
+from lodelight.io.rosbag_convert import (
+    write_cloud_bag,
+    write_out_folder_bag,
+    write_recording_bag,
+    write_trajectory_bag,
+)
+from lodelight.io.rosbag_poses import read_poses
+from lodelight.io.rosbag_writer import SUFFIXES as BAGS
+from lodelight.io.sources import is_recording, open_source
 from lodelight.io.trajectories import WRITERS, read_trajectory, write_euroc, write_trajectory
 from lodelight.messages import Frame, Imu
 from lodelight.rig import Rig
+from lodelight.trajectory import Trajectory
 
 Progress = Callable[[Iterator[Frame], int], Iterator[Frame]]
 
@@ -30,27 +41,54 @@ def convert(
     start_s: float = 0.0,
     end_s: float = math.inf,
     progress: Progress = lambda frames, n: frames,
+    topics: Mapping[str, str] | None = None,
 ) -> Recording | None:
     """Write `source` as what the name of `dest` ends in.
 
     `.tum`, `.txt`, `.csv`, `.kitti`: a trajectory, of a file or the truth of a recording; `.toml`: a rig, of a
-    calibration file or of a recording; else an EuRoC folder of a recording, which is returned with what it skipped.
-    progress : wraps the frames and their number
+    calibration file or of a recording; `.bag`, `.mcap`, `.db3`: a ROS bag of a recording, a trajectory, a PLY cloud or
+    an out folder; else an EuRoC folder of a recording, which is returned with what it skipped.
+    topics : of a ROS bag as source, by role; progress : wraps the frames and their number
     """
     source, dest = Path(source), Path(dest)
     suffix = dest.suffix.lower()
     if suffix in WRITERS:
-        truth = read_trajectory(source) if source.is_file() else open_source(source, rig).ground_truth()
-        if truth is None:
-            raise SourceError(f"{source} has no ground truth to write to {dest}")
-        write_trajectory(dest, truth)
+        write_trajectory(dest, _trajectory(source, rig, topics))
         return None
     if suffix == ".toml":
-        write_rig(dest, load_rig(source) if source.is_file() and rig is None else open_source(source, rig).rig)
+        calibration = source.is_file() and rig is None and not is_recording(source)
+        write_rig(dest, load_rig(source) if calibration else open_source(source, rig, topics).rig)
         return None
-    recording = open_source(source, rig)
-    write_recording(recording, dest, start_s, end_s, progress)
+    if suffix in BAGS and not is_recording(source):
+        _to_bag(source, dest)
+        return None
+    recording = open_source(source, rig, topics)
+    if suffix in BAGS:
+        write_recording_bag(recording, dest, start_s, end_s, progress)
+    else:
+        write_recording(recording, dest, start_s, end_s, progress)
     return recording
+
+
+def _trajectory(source: Path, rig: str | Path | None, topics: Mapping[str, str] | None) -> Trajectory:
+    """Of a file, of a bag's poses, or the truth of a recording."""
+    if rosbag.recognize(source):
+        return read_poses(source, (topics or {}).get("truth"))
+    truth = read_trajectory(source) if source.is_file() else open_source(source, rig).ground_truth()
+    if truth is None:
+        raise SourceError(f"{source} has no ground truth to convert")
+    return truth
+
+
+def _to_bag(source: Path, dest: Path) -> None:
+    if source.is_dir() and (source / "trajectory.tum").is_file():
+        write_out_folder_bag(source, dest)
+    elif source.suffix.lower() == ".ply":
+        write_cloud_bag(dest, read_ply(source))
+    elif source.is_file():
+        write_trajectory_bag(dest, read_trajectory(source))
+    else:
+        open_source(source)  # says what is wrong with it
 
 
 def write_recording(

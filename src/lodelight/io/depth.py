@@ -31,6 +31,12 @@ class DepthReader:
         depth_m = np.take(self._table, raw)
         return self._registration(depth_m) if self._registration else depth_m
 
+    def registered(self, metres: ArrayF32) -> ArrayF32:
+        """As `metres`, of (H, W) float32 m along z of the depth camera, 0 = no reading."""
+        low, high = np.float32(self.spec.min_m), np.float32(self.spec.max_m)
+        depth_m = np.where((metres >= low) & (metres <= high), metres, np.float32(0.0)).astype(np.float32)
+        return self._registration(depth_m) if self._registration else depth_m
+
     def median_m(self, raw: NDArray[np.uint16]) -> float:
         """Median of all readings before the range is applied; 0 where there is no reading."""
         readings = raw[(raw > 0) & (raw < 65535)]

@@ -17,7 +17,7 @@ from lodelight.io.calibrations import euroc_camera, euroc_depth, imu_spec, kalib
 from lodelight.io.listing import ImuTable, ListedRecording, Listing, bad_rows
 from lodelight.io.recording import Skipped
 from lodelight.io.stamps import NS_PER_S, associate, ns_from_text
-from lodelight.io.text import read_files
+from lodelight.io.text import lines, read_files
 from lodelight.io.trajectories import read_trajectory
 from lodelight.io.yaml_file import read_yaml
 from lodelight.rig import CameraSpec, ImuSpec, Rig
@@ -131,7 +131,7 @@ def _truth(root: Path) -> Trajectory | None:
     """T_world_body from the ground truth folders of EuRoC and TUM-VI, or from a lone csv in `groundtruth/`."""
     mav = root / "mav0"
     for name in TRUTHS:
-        if (mav / name / "data.csv").is_file():
+        if (mav / name / "data.csv").is_file() and any(lines(mav / name / "data.csv")):  # one is laid out empty
             truth = read_trajectory(mav / name / "data.csv")
             T_sensor_imu = _pose_on_body(mav, name).inverse() @ _pose_on_body(mav, "imu0")
             return _on(truth, T_sensor_imu)

@@ -39,16 +39,21 @@ def _decode(path: Path, flags: int, size: tuple[int, int] | None) -> AnyArray:
         raise BadFrame("image file is missing") from None
     except OSError as error:
         raise BadFrame(f"image file cannot be read ({error.strerror})") from None
+    return decode(data, flags, size, "image file")
+
+
+def decode(data: bytes, flags: int, size: tuple[int, int] | None, what: str = "image") -> AnyArray:
+    """The image of an encoded file's bytes, read with OpenCV's `flags`; `what` it is, for BadFrame."""
     if not data:
-        raise BadFrame("image file is empty")
+        raise BadFrame(f"{what} is empty")
     if _truncated(data):
-        raise BadFrame("image file is truncated")
+        raise BadFrame(f"{what} is truncated")
     try:
         image: AnyArray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:
-        raise BadFrame("file is no readable image")
+        raise BadFrame(f"{what.removeprefix('image ')} is no readable image")
     if size is not None and image.shape[1::-1] != size:
         raise BadFrame(f"image is {image.shape[1]}x{image.shape[0]}, the rig says {size[0]}x{size[1]}")
     return image

@@ -9,6 +9,8 @@ import numpy as np
 
 from lodelight.errors import SourceError
 from lodelight.geometry.se3 import SE3
+from lodelight.io.rosbag import recognize
+from lodelight.io.rosbag_poses import read_poses
 from lodelight.io.stamps import ns_from_seconds, ns_from_text, seconds_text
 from lodelight.io.text import Table, fields, lines, read_table, write_text
 from lodelight.trajectory import Trajectory
@@ -21,9 +23,11 @@ def read_trajectory(path: str | Path, times: str | Path | None = None) -> Trajec
 
     TUM: `t_s tx ty tz qx qy qz qw`, blanks. EuRoC: `t_ns,px,py,pz,qw,qx,qy,qz,...`, commas; further columns are
     left alone. KITTI: twelve numbers of a 3x4 matrix per row, stamps in seconds from `times` or from `times.txt`
-    beside the poses. Raises SourceError with file and line.
+    beside the poses. A ROS bag: the poses in it, as `read_poses` finds them. Raises SourceError with file and line.
     """
     path = Path(path)
+    if recognize(path):
+        return read_poses(path)
     number, line = next(lines(path), (0, ""))
     width = len(fields(line))
     if not width:
