@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lodelight.features.orb import OrbConfig
+from lodelight.geometry.se3 import SE3
 from lodelight.mapping import invariants
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig, fuse_into
 from lodelight.mapping.map import Map
@@ -21,6 +22,21 @@ def test_sound_maps_have_no_problem_alive_or_thinned(seed: int) -> None:
     if seed:
         assert invariants.problems(thinned(map, seed)) == []
     assert invariants.problems(large_map(20, 100, 500, seed)) == []
+
+
+@pytest.mark.parametrize("order", [range(1, 11), range(10, 0, -1)])
+def test_a_culled_keyframe_stays_where_it_was_and_hangs_on_one_that_is_left(order: range) -> None:
+    map = room_map(n_keyframes=12)
+    believed = {k: map.pose(k) for k in range(12)}
+    for keyframe in order:
+        map.remove_keyframe(keyframe)
+    assert map.keyframes.alive[map.keyframes.parent[1:]].all()  # no chain grows with the run
+    for k in range(12):
+        np.testing.assert_allclose(map.pose(k).matrix, believed[k].matrix, atol=1e-12)  # rounding of a few products
+    map.set_pose(0, map.pose(0) @ SE3.exp(np.array([0.1, 0.0, 0.2, 1.0, 2.0, 3.0])))
+    for k in range(1, 11):
+        before = believed[0].inverse() @ believed[k]
+        np.testing.assert_allclose((map.pose(0).inverse() @ map.pose(k)).matrix, before.matrix, atol=1e-12)
 
 
 def broken(change: Callable[[Map], object]) -> list[str]:

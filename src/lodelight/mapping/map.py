@@ -173,13 +173,21 @@ class Map:
             self.points.alive[point] = False
 
     def remove_keyframe(self, keyframe: int) -> None:
-        """Forget a keyframe: its observations go, its children in the spanning tree pass to its parent."""
+        """Forget a keyframe: its observations go, its children in the spanning tree pass to its parent.
+
+        Culled children too, so that none hangs on a chain of culled ones, which would grow with the run.
+        """
         rows = np.arange(self.feature_range(keyframe).start, self.feature_range(keyframe).stop, dtype=np.int32)
         self.unlink(rows)
         kf, parent = self.keyframes, int(self.keyframes.parent[keyframe])
-        kf.parent[(kf.parent == keyframe) & kf.alive] = parent
+        children = kf.parent == keyframe
         if parent >= 0:
-            self.set_pose(keyframe, self.pose(parent).inverse() @ self.pose(keyframe))
+            T_parent_keyframe = self.pose(parent).inverse() @ self.pose(keyframe)
+            for child in np.flatnonzero(children & ~kf.alive).tolist():
+                self.set_pose(child, T_parent_keyframe @ SE3(kf.R[child].copy(), kf.p[child].copy()))
+                kf.parent[child] = parent
+            self.set_pose(keyframe, T_parent_keyframe)
+        kf.parent[children & kf.alive] = parent
         kf.alive[keyframe] = False
 
     def fuse_points(self, old: int, new: int) -> None:
