@@ -21,7 +21,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command(epilog="Example: lodelight run recordings/room --out out/room --sensors rgbd")
 def run(
-    source: Path = typer.Argument(..., help="EuRoC, TUM RGB-D, KITTI, 7-Scenes folder, ROS bag, images or video."),
+    source: Path = typer.Argument(..., help="A recording of any known format, or the number of a camera."),
     out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
     sensors: str = typer.Option("", help="stereo or rgbd; default: the most the source has."),
     rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
@@ -66,6 +66,7 @@ def slam_to_folder(
     """
     import cv2
 
+    from lodelight.cli.live import stopped_by_interrupt
     from lodelight.cli.progress import track
     from lodelight.compiled import compile_seconds
     from lodelight.mapping.store import save_map
@@ -74,12 +75,13 @@ def slam_to_folder(
     from lodelight.slam import Slam
 
     cv2.setNumThreads(1)  # whole stages run on two threads; image operations that split further only get in the way
+    live = live or recording.is_live
     asked = {"source": str(recording.path), "live": live, "start_s": start_s, "map": known is not None}
-    with Outputs(out, {"run": asked, **as_table(config)}) as outputs:
+    with Outputs(out, {"run": asked, **as_table(config)}) as outputs, stopped_by_interrupt(recording):
         begun_s, compiled_s = time.perf_counter(), compile_seconds()
         slam = Slam(recording.rig, config, map=known, on_event=outputs.event, live=live)
         mapped, first_ns, last_ns = 0, None, 0
-        for estimate in track(slam.run(recording, start_s, end_s), "SLAM", recording.n_frames):
+        for estimate in track(slam.run(recording, start_s, end_s), "SLAM", recording.n_frames or None):
             outputs.frame(estimate, estimate.details["track_ms"], sum(slam.mapping_ms[mapped:]))
             mapped = len(slam.mapping_ms)
             first_ns, last_ns = first_ns or estimate.t_ns, estimate.t_ns

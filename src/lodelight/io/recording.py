@@ -54,6 +54,8 @@ class Recording(ABC):
     skipped : what the last `messages` left out so far; before that, the rows that were no use on opening
     """
 
+    AHEAD = 4  # frames decoded before they are asked for
+
     def __init__(self, path: Path, format: str, rig: Rig, bad_rows: tuple[Skipped, ...] = ()) -> None:
         self.path = path
         self.name = path.resolve().name
@@ -87,6 +89,15 @@ class Recording(ABC):
     def ground_truth(self) -> Trajectory | None:
         """T_world_body where the recording has it; for evaluation alone."""
         return None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it is a camera that runs now, and frames that are not taken in time are lost."""
+        return False
+
+    def stop(self) -> None:
+        """End a live stream after the image that is being taken; from any thread. Others end by themselves."""
+        return
 
     @property
     def duration_s(self) -> float:
@@ -174,7 +185,7 @@ class Recording(ABC):
 
         wanted = (shot for shot in shots if first <= shot.t_ns + offset_ns <= last)
         usable = False
-        with closing(prefetch(wanted, load)) as loaded:
+        with closing(prefetch(wanted, load, self.AHEAD)) as loaded:
             for item in loaded:
                 if isinstance(item, Frame):
                     usable = True

@@ -7,13 +7,14 @@ from functools import partial
 from pathlib import Path
 
 from lodelight.errors import ConfigError, SourceError
-from lodelight.io import euroc, images, kitti, rosbag_recording, sevenscenes, tum_rgbd, video
+from lodelight.io import camera, euroc, images, kitti, rosbag_recording, sevenscenes, tum_rgbd, video
 from lodelight.io.calibrations import load_rig
 from lodelight.io.recording import Recording
 from lodelight.rig import Rig
 
 # In this order: a bare image folder is what is left when nothing says more.
 FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path, Rig | None], Recording]], ...] = (
+    (camera.recognize, camera.open_camera),
     (euroc.recognize, euroc.open_euroc),
     (tum_rgbd.recognize, tum_rgbd.open_tum_rgbd),
     (kitti.recognize, kitti.open_kitti),
@@ -24,7 +25,8 @@ FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path, Rig | None], Record
 )
 KNOWN = (
     "EuRoC or TUM-VI (mav0/), TUM RGB-D (rgb.txt), KITTI odometry (calib.txt, image_0/), "
-    "7-Scenes (frame-000000.color.png), a ROS bag (ROS 1, sqlite3, MCAP), a folder of images, a video file"
+    "7-Scenes (frame-000000.color.png), a ROS bag (ROS 1, sqlite3, MCAP), a folder of images, "
+    "a video file, or the number of a camera"
 )
 
 
@@ -39,7 +41,7 @@ def open_source(
     Raises SourceError where nothing recognises it, CalibrationError where its rig is missing or wrong.
     """
     path = Path(path)
-    if not path.exists():
+    if not path.exists() and not camera.recognize(path):
         raise SourceError(f"recording {path} does not exist")
     if path.name == "mav0":  # the recording is the folder around it
         path = path.resolve().parent
