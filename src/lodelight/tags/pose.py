@@ -129,6 +129,16 @@ def faces(T_cam_tag: SE3) -> bool:
     return bool(T_cam_tag.R[:, 2] @ T_cam_tag.t > 0.0)
 
 
+def linearize_corners(
+    camera: Camera, corners: Array, px: Array, sigma_px: Array, T_cam_tag: SE3
+) -> tuple[float, Array, Array]:
+    """chi2 of measured corners (4, 2) px at a pose, inf where one is not seen; J^T W J (6, 6) and J^T W r (6,)."""
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    R = np.ascontiguousarray(T_cam_tag.R)
+    chi2 = _linearize(camera.model, camera.params, corners, px, sigma_px, R, T_cam_tag.t, H, g)
+    return chi2, H, g
+
+
 @kernel
 def _linearize(
     model: int, params: Array, corners: Array, px: Array, sigma: Array, R: Array, t: Array, H: Array, g: Array
