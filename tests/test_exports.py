@@ -5,7 +5,7 @@ import sys
 
 import lodelight
 
-NAMES = {"Slam", "SlamConfig", "__version__", "open_source"}
+NAMES = {"Localizer", "LocalizerConfig", "Slam", "SlamConfig", "__version__", "load_map", "open_source"}
 
 
 def test_public_names_are_the_stated_ones():

@@ -10,7 +10,7 @@ from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
 from lodelight.io.sources import open_source
 from lodelight.localization.machine import Found
-from lodelight.localization.relocalize import Relocalizer, RelocalizerConfig
+from lodelight.localization.relocalize import Hint, Relocalizer, RelocalizerConfig
 from single_frames import ORB, map_of, shots
 
 
@@ -61,11 +61,11 @@ def test_frames_of_another_room_are_not_found(kitchen):
 def test_a_hint_keeps_the_search_near_it(kitchen):
     map, queries = kitchen
     shot, relocalizer = queries[7], Relocalizer(map, ORB)
-    assert isinstance(relocalizer.find(shot.seen, (shot.T_world_cam, 0.5)), Found)
+    assert isinstance(relocalizer.find(shot.seen, Hint(shot.T_world_cam, 0.5)), Found)
     elsewhere = SE3(shot.T_world_cam.R, shot.T_world_cam.t + np.array([5.0, 0.0, 0.0]))
     turned = shot.T_world_cam @ SE3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
     for hint in (elsewhere, turned):
-        assert relocalizer.find(shot.seen, (hint, 0.5)) == "no keyframe looks alike"
+        assert relocalizer.find(shot.seen, Hint(hint, 0.5)) == "no keyframe looks alike"
 
 
 def test_keyframes_added_and_culled_after_the_index_was_made_are_seen_and_forgotten(kitchen):

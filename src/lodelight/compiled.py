@@ -51,3 +51,13 @@ event.register("numba:compiler_lock", _clock)  # type: ignore[no-untyped-call]
 def compile_seconds() -> float:
     """Seconds this process has spent on compiling so far: to be left out of what a frame costs."""
     return _clock.total_s
+
+
+class Stopwatch:
+    """Wall time since it was made, without what went into compiling kernels."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter() - compile_seconds()
+
+    def ms(self) -> float:
+        return 1e3 * (time.perf_counter() - compile_seconds() - self._start)

@@ -10,6 +10,10 @@ import numpy as np
 from lodelight.geometry.se3 import SE3
 from lodelight.types import Array, ArrayF32, Bytes
 
+LOST_COVARIANCE = np.diag(
+    [np.pi**2] * 3 + [1e6] * 3
+)  # of a pose of which nothing is known: half a turn and a kilometre
+
 Status: TypeAlias = Literal["initializing", "tracking", "degraded", "lost", "relocalized"]
 
 

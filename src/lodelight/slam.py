@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from lodelight.compiled import compile_seconds
+from lodelight.compiled import Stopwatch
 from lodelight.errors import ConfigError
 from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
@@ -26,14 +25,13 @@ from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
-from lodelight.messages import Estimate, Frame, Message
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Message
 from lodelight.rig import Rig
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
 
 EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
 FOREVER_NS = 10**18
-LOST_COVARIANCE = np.diag([math.pi**2] * 3 + [1e6] * 3)
 
 
 @dataclass(frozen=True)
@@ -253,13 +251,3 @@ def _check_sensors(sensors: str, known: bool) -> None:
         raise ConfigError(f"{sensors}: this version does not use the IMU; choose {sensors.removesuffix('-inertial')}")
     if sensors == "mono" and not known:
         raise ConfigError("mono alone gives a map no scale; choose rgbd or stereo, or give a map with --map")
-
-
-class Stopwatch:
-    """Wall time since it was made, without what went into compiling kernels."""
-
-    def __init__(self) -> None:
-        self._start = time.perf_counter() - compile_seconds()
-
-    def ms(self) -> float:
-        return 1e3 * (time.perf_counter() - compile_seconds() - self._start)

@@ -42,6 +42,17 @@ def open_images(path: Path, rig: Rig | None) -> ListedRecording:
     return ListedRecording(path, "images", rig, Listing(t_ns, (list(files),)))
 
 
+def recognize_one(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+def open_one(path: Path, rig: Rig | None) -> ListedRecording:
+    """A single image, taken at 0."""
+    if rig is None:
+        raise CalibrationError(f"{path} says nothing of its camera; give --rig FILE or put a rig.toml beside it")
+    return ListedRecording(path, "image", rig, Listing(np.zeros(1, np.int64), ([path],)))
+
+
 def _order(file: Path) -> tuple[float, str]:
     found = LAST_NUMBER.search(file.stem)
     return (float(found[0]) if found else -1.0, file.name)

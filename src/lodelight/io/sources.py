@@ -22,11 +22,12 @@ FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path, Rig | None], Record
     (rosbag_recording.recognize, rosbag_recording.open_rosbag),
     (images.recognize, images.open_images),
     (video.recognize, video.open_video),
+    (images.recognize_one, images.open_one),
 )
 KNOWN = (
     "EuRoC or TUM-VI (mav0/), TUM RGB-D (rgb.txt), KITTI odometry (calib.txt, image_0/), "
     "7-Scenes (frame-000000.color.png), a ROS bag (ROS 1, sqlite3, MCAP), a folder of images, "
-    "a video file, or the number of a camera"
+    "an image, a video file, or the number of a camera"
 )
 
 

@@ -14,7 +14,8 @@ from lodelight.localization.machine import Found
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
 from lodelight.mapping.verification import Location, Refusal, Verifier, elsewhere
-from lodelight.types import Ints
+from lodelight.rig import CameraSpec
+from lodelight.types import Array, Ints
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class RelocalizerConfig:
         (docs/places-and-loops.md); a poster that hangs in two rooms reaches more, but in few cells.
     rival : an answer elsewhere with so large a share of the best one's points makes it ambiguous
     hint_angle_deg : how far a keyframe's view may be turned from a hinted pose to be looked at
+    hint_sigmas : a hinted pose is off by no more of its own standard deviations than this
     """
 
     sigma_px: float = 1.0
@@ -34,30 +36,65 @@ class RelocalizerConfig:
     min_coverage: float = 0.35
     rival: float = 0.5
     hint_angle_deg: float = 60.0
+    hint_sigmas: float = 3.5
+
+
+@dataclass(frozen=True, eq=False)
+class Hint:
+    """Roughly where a frame was taken: by a light fix, a tag, or what it was before it was lost.
+
+    radius_m : how far off the pose may be besides its covariance, and from how far a place may be seen
+    covariance : (6, 6) of the pose, chart of SE3.perturbed; nothing where None
+    """
+
+    T_world_body: SE3
+    radius_m: float
+    covariance: Array | None = None
+
+    def reach(self, away: Array, sigmas: float) -> Array:
+        """(N,) m: how far off it may be in each direction away (N, 3)."""
+        if self.covariance is None:
+            return np.full(len(away), self.radius_m)
+        length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        variance = np.einsum("ni,ij,nj->n", away, self.covariance[3:, 3:], away) / length**2
+        out: Array = self.radius_m + sigmas * np.sqrt(np.maximum(variance, 0.0))
+        return out
+
+    def turn_deg(self, sigmas: float) -> float:
+        """How far off its direction may be."""
+        if self.covariance is None:
+            return 0.0
+        return float(np.degrees(sigmas * np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1])))
 
 
 class Relocalizer:
-    """Finds frames in a map that others write."""
+    """Finds frames in a map that others write. spec : the camera of the frames, where it is not the map's."""
 
     def __init__(
-        self, map: Map, orb: OrbConfig, places: Places | None = None, config: RelocalizerConfig | None = None
+        self,
+        map: Map,
+        orb: OrbConfig,
+        places: Places | None = None,
+        config: RelocalizerConfig | None = None,
+        spec: CameraSpec | None = None,
     ) -> None:
         self.map = map
         self.config = config or RelocalizerConfig()
         self.places = places or Places(map)
-        self._verifier = Verifier(map, orb, self.config.sigma_px)
+        self.T_body_cam = (spec or map.rig.cameras[0]).T_body_cam
+        self._verifier = Verifier(map, orb, self.config.sigma_px, spec)
 
-    def find(self, seen: Features, hint: tuple[SE3, float] | None = None) -> Found | str:
+    def find(self, seen: Features, hint: Hint | None = None) -> Found | str:
         """Pose of a frame in the map and what it shows of it, or why none is believed.
 
-        hint : a pose and how far off it may be, m; only keyframes from around there are then looked at
+        hint : only keyframes from around there are looked at, and no answer far from there is believed
         """
         with self.map.lock:
             doubts: list[str] = []
             believed: list[tuple[int, Location]] = []
             for keyframe in self._candidates(seen, hint).tolist():
                 found = self._verifier.locate(seen, keyframe, self._verifier.neighbourhood(keyframe))
-                doubt = found.why if isinstance(found, Refusal) else self._doubt(found)
+                doubt = found.why if isinstance(found, Refusal) else self._doubt(found) or self._far(found, hint)
                 if isinstance(found, Location) and not doubt:
                     believed.append((keyframe, found))
                 doubts.append(f"most like keyframe {keyframe}, but {doubt}")
@@ -66,22 +103,30 @@ class Relocalizer:
             believed.sort(key=lambda answer: -len(answer[1]))
             return self._rival(believed) or self._answer(seen, *believed[0])
 
-    def _candidates(self, seen: Features, hint: tuple[SE3, float] | None) -> Ints:
+    def _candidates(self, seen: Features, hint: Hint | None) -> Ints:
         if hint is None:
             return self.places.candidates(seen.desc, limit=self.config.candidates)
-        T_world_body, radius_m = hint
-        near = self._keyframes_near(T_world_body, radius_m)
+        near = self._keyframes_near(hint)
         score, _ = self.places.similarity(seen.desc)
         return near[np.argsort(-score[near], kind="stable")][: self.config.candidates]
 
-    def _keyframes_near(self, T_world_body: SE3, radius_m: float) -> Ints:
-        """Keyframes not farther than radius_m from a pose, that look where it looks."""
-        k, T_body_cam = self.map.keyframes, self.map.rig.cameras[0].T_body_cam
-        distance = np.linalg.norm(k.p - T_world_body.t, axis=1)
-        axis = T_body_cam.R[:, 2]
-        cosine = k.R @ axis @ (T_world_body.R @ axis)
-        near = k.alive & (distance <= radius_m) & (cosine >= math.cos(math.radians(self.config.hint_angle_deg)))
-        return np.flatnonzero(near).astype(np.int32)
+    def _keyframes_near(self, hint: Hint) -> Ints:
+        """Keyframes whose cameras may be within reach of a hint's, and look where it looks."""
+        k, sigmas, T_body_mapped = self.map.keyframes, self.config.hint_sigmas, self.map.rig.cameras[0].T_body_cam
+        T_world_cam = hint.T_world_body @ self.T_body_cam
+        away = k.p + k.R @ T_body_mapped.t - T_world_cam.t
+        cosine = k.R @ T_body_mapped.R[:, 2] @ T_world_cam.R[:, 2]
+        turn_deg = min(self.config.hint_angle_deg + hint.turn_deg(sigmas), 180.0)
+        near = k.alive & (np.linalg.norm(away, axis=1) <= hint.reach(away, sigmas))
+        return np.flatnonzero(near & (cosine >= math.cos(math.radians(turn_deg)) - 1e-9)).astype(np.int32)
+
+    def _far(self, found: Location, hint: Hint | None) -> str:
+        """Whether an answer is out of a hint's reach; empty where it is not."""
+        if hint is None:
+            return ""
+        away = found.T_world_body.t - hint.T_world_body.t
+        off_m, reach_m = float(np.linalg.norm(away)), float(hint.reach(away[None], self.config.hint_sigmas)[0])
+        return f"found {off_m:.1f} m from where it was hinted, beyond {reach_m:.1f} m" if off_m > reach_m else ""
 
     def _doubt(self, found: Location) -> str:
         """Why a location is not to be believed; empty where it is."""

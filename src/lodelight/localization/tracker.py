@@ -15,9 +15,9 @@ from lodelight.features.orb import OrbConfig
 from lodelight.geometry.pnp import ransac_pnp
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
-from lodelight.mapping.sight import in_sight, local_keyframes, points_of_keyframes
+from lodelight.mapping.sight import Sight, in_sight, local_keyframes, points_of_keyframes
 from lodelight.rig import Rig
-from lodelight.types import AnyArray, Array, ArrayF32, Ints, Words
+from lodelight.types import AnyArray, Array, ArrayF32, Bools, Ints, Words
 
 MAX_DEPTH_RATIO = 0.5  # a prediction of where things are is not wrong by half of their depth
 MIN_DEPTH_M = 0.1
@@ -50,6 +50,7 @@ class Tracked:
 
     point : (N,) map point of every feature, -1 = none; inliers only
     reference : the keyframe that sees most of those points; noise : sigma of its corners over a sharp frame's
+    temporary : (N,) temporary point of every feature, -1 = none; None where there are no such points
     """
 
     t_ns: int
@@ -61,6 +62,7 @@ class Tracked:
     noise: float = 1.0
     why_lost: str = ""
     T_reference_body: SE3 = field(default_factory=SE3.identity)
+    temporary: Ints | None = None
 
     @property
     def n_inliers(self) -> int:
@@ -142,14 +144,7 @@ class Tracker:
         local = points_of_keyframes(map, voting)
         sight = in_sight(map, local, T_world_body, self.T_body_cam, self.camera, orb)
         map.points.n_visible[sight.point] += 1
-        new = ~np.isin(sight.point, point[point >= 0])
-        radius = np.where(sight.cosine > 0.998, 2.5, 4.0) * search * orb.scale(sight.octave)
-        match = index.search(
-            sight.px[new], radius[new], (sight.octave[new] - 1, sight.octave[new] + 1),
-            map.points.desc[sight.point[new]], free=point < 0, ratio=0.8,
-        )  # fmt: skip
-        point = point.copy()
-        point[match[match >= 0]] = sight.point[new][match >= 0]
+        point = self._matched(sight, map.points.desc[sight.point], point, point < 0, index, search)
         used = np.flatnonzero(point >= 0)
         solved, noise = self._solve(T_world_body, seen.take(used), map.points.xyz[point[used]])
         point[used[~solved.inliers]] = -1
@@ -171,6 +166,22 @@ class Tracker:
         self.last = tracked
 
     # -- parts --------------------------------------------------------------------------------------------------
+
+    def _matched(self, sight: Sight, desc: Words, point: Ints, free: Bools, index: FeatureIndex, search: float) -> Ints:
+        """`point` (N,) with those in sight added that were found near where they should be.
+
+        desc : (M, 4) of the points in sight; free : (N,) features that may be taken; search : window in units of a
+        corner's own scale
+        """
+        new = ~np.isin(sight.point, point[point >= 0])
+        octave = sight.octave[new]
+        radius = np.where(sight.cosine[new] > 0.998, 2.5, 4.0) * search * self.orb.scale(octave)
+        match = index.search(
+            sight.px[new], radius, (octave - 1, octave + 1), desc[new], free=free, ratio=0.8
+        )  # fmt: skip
+        point = point.copy()
+        point[match[match >= 0]] = sight.point[new][match >= 0]
+        return point
 
     def _moved_with_map(self, frame: Tracked) -> SE3:
         """T_world_body of a past frame, as its reference keyframe has been corrected since."""
@@ -251,7 +262,7 @@ class Tracker:
         excess = solved.n_inliers - chance * n - CHANCE_SIGMA * math.sqrt(chance * (1.0 - chance) * n)
         return max(excess, 0.0) / (INLIERS - chance) if chance < INLIERS else 0.0
 
-    def _solve(self, start: SE3, seen: Features, xyz: Array) -> tuple[PoseResult, float]:
+    def _solve(self, start: SE3, seen: Features, xyz: Array, weight: Array | float = 1.0) -> tuple[PoseResult, float]:
         """Motion-only optimization of features against world positions (N, 3), and by how much this frame's noise
         exceeds a sharp one's.
 
@@ -263,11 +274,12 @@ class Tracker:
         z = ((start @ self.T_body_cam).inverse() @ xyz)[:, 2]
         unlike = (seen.inv_depth > 0) & (np.abs(z * seen.inv_depth - 1.0) > MAX_DEPTH_RATIO)
         possible = ~(unlike | (z < MIN_DEPTH_M))
+        information = np.where(possible, weight, 0.0)
         noise = 1.0
         for _ in range(2):
             solved = optimize_pose(
                 start, self.T_body_cam, self.camera, xyz, seen.px, noise * self._sigma_px(seen),
-                seen.inv_depth, noise * seen.sigma_inv_depth, information_weight=possible.astype(np.float64),
+                seen.inv_depth, noise * seen.sigma_inv_depth, information_weight=information,
             )  # fmt: skip
             expected = np.where(seen.inv_depth > 0, MEDIAN_CHI2_3, MEDIAN_CHI2_2)
             excess = np.median((solved.chi2 / expected)[possible]) if possible.any() else 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -72,11 +73,31 @@ def in_sight(
 
     any_view : also from directions and distances at which the patch may look different
     """
+    mapped_px = map.rig.cameras[0].camera.focal_px
+    return in_sight_of(map.points, points, mapped_px, T_world_body, T_body_cam, camera, orb, any_view)
+
+
+def in_sight_of(
+    p: Any,
+    points: Ints,
+    mapped_focal_px: float,
+    T_world_body: SE3,
+    T_body_cam: SE3,
+    camera: Camera,
+    orb: OrbConfig,
+    any_view: bool = False,
+) -> Sight:
+    """As `in_sight`, of rows of a table p with xyz, normal, d_min and d_max as `Map.points` has them.
+
+    mapped_focal_px : of the lens that d_min and d_max are for
+
+    A longer lens shows a patch larger, so it is found at a coarser octave, and from farther away.
+    """
     T_cam_world = (T_world_body @ T_body_cam).inverse()
-    p = map.points
     px, octave, cosine, seen = _project_points(
         points, p.xyz, p.normal, p.d_min, p.d_max, T_cam_world.R, T_cam_world.t,
         camera.model, camera.params, camera.width, camera.height, orb.scale_factor, orb.n_levels, any_view,
+        camera.focal_px / mapped_focal_px,
     )  # fmt: skip
     return Sight(points[seen], px[seen], octave[seen], cosine[seen])
 
@@ -85,6 +106,7 @@ def in_sight(
 def _project_points(
     points: Ints, xyz: Array, normal: Array, d_min: Array, d_max: Array, R_cam_world: Array, p_cam_world: Array,
     model: int, params: Array, width: int, height: int, scale_factor: float, n_levels: int, any_view: bool,
+    magnification: float,
 ) -> tuple[Array, Ints, Array, Bools]:  # fmt: skip
     n = len(points)
     px = np.zeros((n, 2))
@@ -108,6 +130,7 @@ def _project_points(
         dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
         d = math.sqrt(dx * dx + dy * dy + dz * dz)
         cosine[i] = (dx * normal[m, 0] + dy * normal[m, 1] + dz * normal[m, 2]) / max(d, 1e-9)
+        d /= magnification  # from where the mapping lens would show the patch as large
         if not any_view and (d < d_min[m] / RANGE_SLACK or d > d_max[m] * RANGE_SLACK or cosine[i] < MIN_VIEW_COSINE):
             continue
         level = math.ceil(math.log(max(d_max[m] / max(d, 1e-9), 1e-9)) / log_scale - 0.5)

@@ -19,6 +19,7 @@ from lodelight.geometry.pnp import ransac_pnp
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import in_sight, points_of_keyframes
+from lodelight.rig import CameraSpec
 from lodelight.types import AnyArray, Array, Ints
 
 MIN_AGREEING = 10  # matches, and of them those that fit one pose, below which it is not worth looking on
@@ -71,14 +72,16 @@ class Verifier:
     """Locates images in parts of a map.
 
     orb : what the features were extracted with; sigma_px : noise of a corner at the finest octave
+    spec : the camera of the images, where it is not the map's
     """
 
-    def __init__(self, map: Map, orb: OrbConfig, sigma_px: float) -> None:
+    def __init__(self, map: Map, orb: OrbConfig, sigma_px: float, spec: CameraSpec | None = None) -> None:
+        spec = spec or map.rig.cameras[0]
         self.map = map
         self.orb = orb
         self.sigma_px = sigma_px
-        self.camera = map.rig.cameras[0].camera
-        self.T_body_cam = map.rig.cameras[0].T_body_cam
+        self.camera = spec.camera
+        self.T_body_cam = spec.T_body_cam
 
     def neighbourhood(self, keyframe: int, excluded: AnyArray | None = None, size: int = 10) -> Ints:
         """A keyframe and those that share most points with it, without the excluded ones."""
@@ -178,7 +181,7 @@ class Verifier:
         of the way along shows.
         """
         k, by = self.map.keyframes, self.map.features.keyframe[self.map.points.head[point]]
-        centre = k.p[by] + k.R[by] @ self.T_body_cam.t
+        centre = k.p[by] + k.R[by] @ self.map.rig.cameras[0].T_body_cam.t
         xyz = self.map.points.xyz[point]
         farther = centre + (xyz - centre) / (1.0 - self._depth_sigma(point))[:, None]
         T_cam_world = (T_world_body @ self.T_body_cam).inverse()

@@ -1,0 +1,123 @@
+"""Follows a camera in the current map: the points of the map around it, which nobody writes, and temporary points.
+
+While a frame is matched, one array says what each feature is: a map point p as p, a temporary point t as -2 - t,
+nothing as -1. What the map reads of it takes every negative number for nothing, so no temporary point can be taken
+for one of the map's. A finished `Tracked` has the two kinds apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lodelight.features.features import Features
+from lodelight.features.matching import FeatureIndex
+from lodelight.features.orb import OrbConfig
+from lodelight.geometry.se3 import SE3
+from lodelight.localization.temporary import TemporaryPoints
+from lodelight.localization.tracker import Landmarks, Tracked, Tracker, TrackerConfig
+from lodelight.mapping.map import Map
+from lodelight.mapping.sight import in_sight, local_keyframes, points_of_keyframes
+from lodelight.rig import Rig
+from lodelight.types import Ints
+
+FIRST_TEMPORARY = -2
+
+
+class Follower(Tracker):
+    """A tracker that leaves the map as it is. temporary : the overlay, empty while the map is enough"""
+
+    def __init__(
+        self,
+        rig: Rig,
+        map: Map,
+        orb: OrbConfig,
+        config: TrackerConfig,
+        temporary: TemporaryPoints,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(rig, map, orb, config, seed)
+        self.temporary = temporary
+
+    def forget(self) -> None:
+        """The camera may be anywhere now."""
+        self.last = None
+        self._motion = None
+
+    def forget_temporary(self) -> None:
+        """Clear the overlay, and the last frame's matches with it."""
+        self.temporary.clear()
+        if self.last is not None:
+            self.last.temporary = None
+
+    def predicted(self, t_ns: int) -> SE3 | None:
+        """T_world_body to expect, by constant velocity; None where nothing is known."""
+        return None if self.last is None else self._predict(self.last.T_world_body, t_ns)
+
+    def refine(
+        self,
+        t_ns: int,
+        seen: Features,
+        T_world_body: SE3,
+        point: Ints,
+        index: FeatureIndex,
+        search: float,
+        map_alone: bool = False,
+    ) -> Tracked:
+        """As `Tracker.refine`, in the current map; point : (N,) matches so far, of both kinds.
+
+        map_alone : without temporary points
+        """
+        map = self.map
+        reference = self.last.reference if self.last else 0
+        voting = local_keyframes(map, point, otherwise=reference)
+        sight = in_sight(map, points_of_keyframes(map, voting), T_world_body, self.T_body_cam, self.camera, self.orb)
+        mapped = np.where(point >= 0, point, -1).astype(np.int32)
+        mapped = self._matched(sight, map.points.desc[sight.point], mapped, mapped < 0, index, search)
+        carried = np.where((point <= FIRST_TEMPORARY) & (mapped < 0), FIRST_TEMPORARY - point, -1).astype(np.int32)
+        overlay = self.temporary.table
+        use_overlay = not map_alone and len(overlay) > 0
+        if map_alone:
+            carried[:] = -1
+        if use_overlay:
+            around = self.temporary.in_sight(T_world_body)
+            free = (mapped < 0) & (carried < 0)
+            carried = self._matched(around, overlay.desc[around.point], carried, free, index, search)
+        used = np.flatnonzero((mapped >= 0) | (carried >= 0))
+        of_map = mapped[used] >= 0
+        xyz = np.empty((len(used), 3))
+        xyz[of_map] = map.points.xyz[mapped[used[of_map]]]
+        xyz[~of_map] = overlay.xyz[carried[used[~of_map]]]
+        weight = np.where(of_map, 1.0, self.temporary.config.weight)
+        solved, noise = self._solve(T_world_body, seen.take(used), xyz, weight)
+        wrong = used[~solved.inliers]
+        mapped[wrong], carried[wrong] = -1, -1
+        if use_overlay:
+            self.temporary.count(around.point, carried[carried >= 0])
+            carried = self.temporary.alive(carried)
+        tracked = Tracked(
+            t_ns, seen, solved.T_world_body, solved.covariance, mapped, int(voting[0]), noise, temporary=carried
+        )
+        if solved.n_inliers < self.config.min_inliers:
+            tracked.why_lost = f"{solved.n_inliers} of {len(used)} matches with the local map are inliers"
+        return tracked
+
+    def _landmarks_of_frame(self, frame: Tracked, T_world_body: SE3) -> Landmarks:
+        """The last frame's points of both kinds."""
+        known = super()._landmarks_of_frame(frame, T_world_body)
+        if frame.temporary is None or not len(self.temporary):
+            return known
+        carried = self.temporary.alive(frame.temporary)
+        use = np.flatnonzero(carried >= 0)
+        seen, carried = frame.seen.take(use), carried[use]
+        return Landmarks(
+            np.append(known.point, FIRST_TEMPORARY - carried).astype(np.int32),
+            np.concatenate([known.xyz, self.temporary.table.xyz[carried]]),
+            np.concatenate([known.desc, seen.desc]),
+            np.append(known.octave, seen.octave),
+            np.append(known.angle, seen.angle),
+        )
+
+
+def n_temporary(tracked: Tracked) -> int:
+    """Temporary points that agree with a frame's pose."""
+    return 0 if tracked.temporary is None else int(np.count_nonzero(tracked.temporary >= 0))

@@ -1,0 +1,165 @@
+"""The localization system: features in, pose in a finished map out; the map is never written. Read `step` first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lodelight.compiled import Stopwatch
+from lodelight.errors import ConfigError, MapError
+from lodelight.features.frontend import FrontEnd
+from lodelight.features.orb import OrbConfig
+from lodelight.geometry.se3 import SE3, carried_covariance
+from lodelight.io.pacing import Paced
+from lodelight.io.recording import Recording
+from lodelight.localization.follower import n_temporary
+from lodelight.localization.ladder import EventSink, Ladder, LadderConfig
+from lodelight.localization.relocalize import Hint
+from lodelight.localization.states import State
+from lodelight.localization.tracker import Tracked
+from lodelight.mapping.map import Map
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message
+from lodelight.rig import Rig
+from lodelight.types import Array
+
+DRIFT = 0.02  # of the way without the map, one standard deviation; science note B3
+
+
+@dataclass(frozen=True)
+class LocalizerConfig:
+    """Every default of the system, by stage.
+
+    sensors : mono, stereo or rgbd; temporary_points : whether they may carry the camera where the map is not enough
+    hint_reach_m : from how far away the place of a hinted pose may be seen
+    """
+
+    sensors: str = "mono"
+    seed: int = 0
+    temporary_points: bool = True
+    hint_reach_m: float = 3.0
+    orb: OrbConfig = field(default_factory=OrbConfig)
+    ladder: LadderConfig = field(default_factory=LadderConfig)
+
+
+class Localizer:
+    """Finds and follows a camera in a map.
+
+    `run` streams a recording; `feed` takes one message at a time, for live use; `close` ends.
+    rig : of the camera, which need not be the one that made the map; its first camera is used
+    on_event : told of what happens, as on_event(t_ns, kind, **fields)
+    Poses are T_world_body in the map's frame, of the body of `rig`.
+    Raises MapError where the map has nothing to localize in, ConfigError on sensors that are unknown.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        map: Map,
+        config: LocalizerConfig | None = None,
+        on_event: EventSink | None = None,
+        live: bool = False,
+    ) -> None:
+        self.config = config or LocalizerConfig()
+        _check(map, self.config.sensors)
+        self.map = map
+        self.live = live
+        self.on_event = on_event
+        self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
+        self.ladder = Ladder(
+            rig, map, self.config.orb, self.config.ladder, self.config.seed, self.config.temporary_points, live,
+            self._emit,
+        )  # fmt: skip
+        self.relocalizations = 0
+        self.dropped = 0
+
+    def run(self, recording: Recording, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Estimate]:
+        """Estimates of all frames of a recording, as a robot would have had them at the time."""
+        messages: Iterator[Message] = recording.messages(self.config.sensors, start_s, end_s)
+        if self.live:
+            messages = iter(Paced(messages, self._dropped))
+        for message in messages:
+            estimate = self.feed(message)
+            if estimate is not None:
+                yield estimate
+        self.close()
+
+    def feed(self, message: Message | LightFix) -> Estimate | None:
+        """One message; an estimate for every frame. A light fix restricts where a lost camera is looked for."""
+        if isinstance(message, LightFix):
+            if message.T_world_body is not None:
+                self.hint(message.t_ns, message.T_world_body, message.covariance)
+            return None
+        return self.step(message) if isinstance(message, Frame) else None
+
+    def hint(self, t_ns: int, T_world_body: SE3, covariance: Array) -> None:
+        """Where the body was by something else, a light fix or a tag: a lost camera is looked for there for 2 s.
+
+        covariance : (6, 6), chart of SE3.perturbed
+        """
+        self.ladder.hint = (t_ns, Hint(T_world_body, self.config.hint_reach_m, covariance))
+
+    def step(self, frame: Frame) -> Estimate:
+        """One frame: see it, locate it."""
+        clock = Stopwatch()
+        seen = self.front_end.process(frame)
+        tracked = self.ladder.locate(frame.t_ns, seen)
+        self.relocalizations += self.ladder.status == "relocalized"
+        details = {
+            "temporary": float(n_temporary(tracked)),
+            "mono": float(self.ladder.states.state is State.carried),
+            "track_ms": clock.ms(),
+        }
+        return Estimate(
+            frame.t_ns, self.ladder.status, tracked.T_world_body, self._covariance(tracked), self.ladder.why,
+            tracked.n_inliers, details,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Wait for what runs beside, and clear what is temporary."""
+        self.ladder.close()
+
+    @property
+    def confirmed(self) -> list[tuple[int, SE3]]:
+        """Poses (t_ns, T_world_body) of frames that were believed only after later ones had agreed."""
+        return self.ladder.confirmed
+
+    def stats(self) -> dict[str, object]:
+        """Counts for `metrics.json`."""
+        return {
+            "keyframes": len(self.map.alive_keyframes),
+            "map_points": len(self.map.alive_points),
+            "loops": len(self.map.loops),
+            "relocalizations": self.relocalizations,
+            "temporary_points": {"created": self.ladder.temporary.created, "left": self.ladder.temporary_left},
+            "dropped": self.dropped,
+        }
+
+    def _emit(self, t_ns: int, kind: str, **fields: object) -> None:
+        if self.on_event is not None:
+            self.on_event(t_ns, kind, **fields)
+
+    def _dropped(self, t_ns: int) -> None:
+        self.dropped += 1
+        self._emit(t_ns, "dropped", why="the frames before it took too long")
+
+    def _covariance(self, tracked: Tracked) -> Array:
+        """Of the pose in the map: its own against the map there, what the map there carries, and drift without it."""
+        if tracked.why_lost:
+            return LOST_COVARIANCE
+        known: Array = self.map.keyframes.covariance[tracked.reference]
+        total = tracked.covariance + carried_covariance(self.map.pose(tracked.reference), known, tracked.T_world_body)
+        if self.ladder.states.state is State.carried:
+            total[3:, 3:] += (DRIFT * self.ladder.states.carried_m) ** 2 * np.eye(3)
+        return total
+
+
+def _check(map: Map, sensors: str) -> None:
+    if sensors.endswith("-inertial"):
+        raise ConfigError(f"{sensors}: localization does not use the IMU; choose {sensors.removesuffix('-inertial')}")
+    if len(map.alive_keyframes) == 0 or len(map.alive_points) == 0:
+        raise MapError("the map is empty: it has no keyframe with points; map the building first, with lodelight run")
+    if not map.features.desc.any() or not map.points.desc[map.alive_points].any():
+        raise MapError("the map has no descriptors, so nothing can be recognised in it; map again with lodelight run")
