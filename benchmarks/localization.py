@@ -1,14 +1,13 @@
 """Localization in a saved map, measured: `python benchmarks/localization.py TASK ...`
 
-    blocks RECORDING --length 30    map from the even blocks of a recording with depth, queries from the odd ones, colour
-                                    alone
+blocks RECORDING --length 30    map from even blocks of a recording with depth, queries from odd ones,
+                                colour alone
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections import Counter
 from dataclasses import replace
@@ -29,7 +28,6 @@ from lodelight.messages import Estimate, Frame
 from lodelight.settings import with_settings
 from lodelight.slam import Slam, SlamConfig
 from lodelight.trajectory import Trajectory
-
 
 SIGMA_M, SIGMA_RAD = 0.02, 0.02  # errors of a run: how positions and attitudes weigh when frames are laid together
 
