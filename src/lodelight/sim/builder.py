@@ -6,13 +6,12 @@ import math
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lodelight.anchors import Anchors, Light, Tag
 from lodelight.anchors.payload import tag_payload
-from lodelight.errors import ConfigError
 from lodelight.geometry.se3 import SE3
 from lodelight.sim import prints
 from lodelight.sim.faults import Faults
@@ -186,7 +185,8 @@ class Builder:
         """A round light that blinks at its own frequency; `luminance` is its mean over a period."""
         label = f"L{len(self.lights) + 1:02d}"
         center = self._under(x, y, z)
-        self.lights.append(Light(label, frequency_hz, center, radius_m=radius_m))
+        aside = np.array([1.0, 0.0, 0.0]) if label == self.faults.moved_light else np.zeros(3)
+        self.lights.append(Light(label, frequency_hz, center + aside, radius_m=radius_m))
         if label == self.faults.light:  # it blinks as another light does; the survey does not know
             frequency_hz += 600.0 if frequency_hz < 7000.0 else -600.0
         phase = float(self.random(f"phase {label}").uniform())
@@ -202,7 +202,7 @@ class Builder:
     def _lamp(self, lamp: Lamp) -> None:
         index = len(self.lamps)
         if self.changed and self.random(f"dark {index}").random() < DARK_SHARE:
-            lamp = Lamp(**{**lamp.__dict__, "on": False})
+            lamp = replace(lamp, on=False)
         self.lamps.append(lamp)
         (w, h), c = lamp.size_m, lamp.center
         with self.world():
@@ -281,11 +281,12 @@ class Builder:
 
     def finish(self) -> Building:
         """Pack everything; the light is not baked yet."""
-        self._check_faults()
+        self.faults.check(self.name, {tag.id for tag in self.tags}, {light.id for light in self.lights})
         if self.faults.duplicated_tag:
             where = self.tags[-1].T_world_tag
             assert where is not None
             self._hang(self.faults.duplicated_tag, where, 0.4)
+        self.lamps = self.faults.swapped(self.lamps)
         crowd = Crowd(self.route, self.faults.people, self.seed) if self.faults.people else None
         surfaces: dict[str, Material] = {name: Material(image) for name, image in self.pictures.items()}
         used = {q.surface for q in self.mesh.quads + (crowd.quads if crowd else [])} | {"stain"}
@@ -293,16 +294,6 @@ class Builder:
         scene = assemble(self.mesh, surfaces, self.lamps, crowd.quads if crowd else None)
         anchors = Anchors(tuple(self.tags), tuple(self.lights))
         return Building(self.name, scene, anchors, self.route, self.height_m, crowd)
-
-    def _check_faults(self) -> None:
-        tags, lights = {tag.id for tag in self.tags}, {light.id for light in self.lights}
-        for label, known in (
-            (self.faults.moved_tag, tags),
-            (self.faults.duplicated_tag, tags),
-            (self.faults.light, lights),
-        ):
-            if label and label not in known:
-                raise ConfigError(f"{self.name} has no {label!r} to go wrong; it has {', '.join(sorted(known))}")
 
 
 def _triple(v: Array) -> tuple[float, float, float]:

@@ -32,5 +32,8 @@ def write_contact_sheet(out: Path, camera: str = "cam0") -> Path:
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
     sheet = np.vstack([np.hstack(tiles[i : i + COLUMNS]) for i in range(0, len(tiles), COLUMNS)])
     target = out / "contact_sheet.png"
-    target.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+    try:
+        target.write_bytes(cv2.imencode(".png", sheet)[1].tobytes())
+    except OSError as error:
+        raise SourceError(f"cannot write {target}: {error.strerror}; make room") from None
     return target

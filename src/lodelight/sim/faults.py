@@ -12,6 +12,7 @@ import numpy as np
 
 from lodelight.errors import ConfigError
 from lodelight.rig import Rig
+from lodelight.sim.scene import Lamp
 from lodelight.types import Array, Bools
 
 NAMES = {
@@ -20,6 +21,8 @@ NAMES = {
     "time-offset": "seconds to add to image stamps to get the IMU's time, not told in rig.toml (0.02)",
     "extrinsics": "DEGREES:METRES by which rig.toml is wrong about every camera (1:0.01)",
     "light": "id of a light that blinks at another's frequency (L02)",
+    "moved-light": "id of a light that hangs a metre from where it was surveyed (L02)",
+    "swapped-lights": "FIRST:SECOND, ids of two lights that blink at each other's frequency (L02:L03)",
     "moved-tag": "id of a tag that hangs half a metre from where it was surveyed (the first QR code)",
     "duplicated-tag": "id of a tag of which a second copy hangs beside the last one (the first QR code)",
     "people": "number of person-sized boxes that walk about (2)",
@@ -36,6 +39,8 @@ class Faults:
     time_offset_s: float = 0.0
     extrinsics: tuple[float, float] = (0.0, 0.0)
     light: str = ""
+    moved_light: str = ""
+    swapped_lights: tuple[str, ...] = ()
     moved_tag: str = ""
     duplicated_tag: str = ""
     people: int = 0
@@ -73,9 +78,32 @@ class Faults:
             return replace(self, kidnap_s=float(value or 0.5 * duration_s))
         if name == "light":
             return replace(self, light=value or "L02")
+        if name == "moved-light":
+            return replace(self, moved_light=value or "L02")
+        if name == "swapped-lights":
+            first, colon, second = (value or "L02:L03").partition(":")
+            if not colon or first == second:
+                raise ValueError
+            return replace(self, swapped_lights=(first, second))
         if name == "moved-tag":
             return replace(self, moved_tag=value or "Q01")
         return replace(self, duplicated_tag=value or "Q01")
+
+    def check(self, building: str, tags: set[str], lights: set[str]) -> None:
+        """Raises ConfigError where a tag or light that is to go wrong is not among the building's."""
+        for label, known in (
+            (self.moved_tag, tags),
+            (self.duplicated_tag, tags),
+            *((label, lights) for label in (self.light, self.moved_light, *self.swapped_lights)),
+        ):
+            if label and label not in known:
+                raise ConfigError(f"{building} has no {label!r} to go wrong; it has {', '.join(sorted(known))}")
+
+    def swapped(self, lamps: list[Lamp]) -> list[Lamp]:
+        """The lamps with two lights blinking as each other; the survey does not know."""
+        theirs = {lamp.id: lamp.frequency_hz for lamp in lamps if lamp.id in self.swapped_lights}
+        other = dict(zip(self.swapped_lights, reversed(self.swapped_lights), strict=True))
+        return [replace(p, frequency_hz=theirs[other[p.id]]) if p.id in theirs else p for p in lamps]
 
     def kept(self, count: int, rng: np.random.Generator) -> Bools:
         """Which of `count` instants have images; the first always has."""

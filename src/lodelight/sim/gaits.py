@@ -58,7 +58,7 @@ def generate(
     """
     n = int(np.ceil(duration_s / KNOT_S)) + DEGREE + 1
     t = KNOT_S * (np.arange(n, dtype=np.float64) - 0.5 * (DEGREE - 1)) - standstill_s
-    line, heading = _rounded(route, gait.round_m)
+    line, heading = rounded(route, gait.round_m)
     s_line = STEP_M * np.arange(len(line) + 1)
     lap = s_line[-1]
     along, speed = _progress(gait, t, heading, rng)
@@ -83,7 +83,7 @@ def generate(
 
 def lap_seconds(gait: Gait, route: Array) -> float:
     """Time of one lap of a closed route, about: bends slow it down."""
-    _, heading = _rounded(route, gait.round_m)
+    _, heading = rounded(route, gait.round_m)
     return float(STEP_M * np.sum(1.0 / _slow(gait, heading)) / gait.speed)
 
 
@@ -111,7 +111,7 @@ def _progress(gait: Gait, t: Array, heading: Array, rng: np.random.Generator) ->
     return along, speed
 
 
-def _rounded(route: Array, radius: float) -> tuple[Array, Array]:
+def rounded(route: Array, radius: float) -> tuple[Array, Array]:
     """The route every STEP_M with its corners rounded, (M, 2) m, and its heading, rad, unwrapped."""
     closed = np.vstack([route, route[:1]])
     legs = np.linalg.norm(np.diff(closed, axis=0), axis=1)

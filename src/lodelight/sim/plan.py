@@ -128,5 +128,5 @@ def _page(building: Building, motion: Motion | None) -> str:
     figure.update_layout(title=building.name, template="simple_white", hovermode="closest", height=800)
     figure.update_yaxes(scaleanchor="x", title="y, m")
     figure.update_xaxes(title="x, m")
-    page: str = figure.to_html(include_plotlyjs=True, full_html=True)
+    page: str = figure.to_html(include_plotlyjs=True, full_html=True, div_id="plan")  # not a random name
     return page

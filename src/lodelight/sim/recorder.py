@@ -151,21 +151,30 @@ def _write_texts(simulation: Simulation, out: Path, folders: dict[str, Path]) ->
 
 
 def _jobs(simulation: Simulation) -> list[Job]:
-    """Every image of every camera by time; depth comes with the image of camera 0."""
-    rig, building, motion = simulation.rig, simulation.building, simulation.motion
-    jobs: list[Job] = []
+    """Every image of every camera by time; registered depth comes with the image of camera 0."""
+    rig, motion, faults = simulation.rig, simulation.motion, simulation.faults
     lead = rig.cameras[0]
-    metered = exposures(building, lead, motion, simulation.stamps(lead))
-    kept = simulation.faults.kept(len(metered), np.random.default_rng([simulation.seed, 5]))
-    for number, spec in enumerate([*rig.cameras, *([rig.lights] if rig.lights else [])]):
-        imager = Imager(building, spec, motion)
-        is_light = spec is rig.lights
-        folder = "light0" if is_light else f"cam{number}"
-        names = [folder, "depth0"] if number == 0 and rig.depth else [folder]
+    metered_ns = simulation.stamps(lead) + round(lead.time_offset_s * NS_PER_S)
+    metered = exposures(simulation.building, lead, motion, simulation.stamps(lead))
+    kept = faults.kept(len(metered), np.random.default_rng([simulation.seed, 5]))
+    cameras = [(f"cam{i}", spec) for i, spec in enumerate(rig.cameras)]
+    if rig.depth is not None and not rig.depth.registered:
+        cameras.append(("depth0", CameraSpec("depth0", rig.depth.camera, rig.depth.T_body_depth, lead.rate_hz)))
+    if rig.lights is not None:
+        cameras.append(("light0", rig.lights))
+    jobs: list[Job] = []
+    for number, (name, spec) in enumerate(cameras):
+        imager = Imager(simulation.building, spec, motion)
+        names = [name, "depth0"] if number == 0 and rig.depth is not None and rig.depth.registered else [name]
         for index, t in enumerate(simulation.stamps(spec).tolist()):
-            if not is_light and not kept[index]:
+            at = t + round(spec.time_offset_s * NS_PER_S)
+            last = max(0, int(np.searchsorted(metered_ns, at, side="right")) - 1)  # of camera 0, at this time
+            if name == "light0":
+                exposure = Exposure(spec.exposure_s, LIGHT_GAIN)
+            elif kept[last]:
+                exposure = metered[last]
+            else:
                 continue
-            exposure = Exposure(spec.exposure_s, LIGHT_GAIN) if is_light else metered[index]
             jobs.append((t, names, _shot(simulation, imager, names, t, exposure, number, index)))
     return sorted(jobs, key=lambda job: (job[0], job[1]))
 
@@ -176,10 +185,10 @@ def _shot(
     def work() -> Shot:
         covered = simulation.faults.dark(imager.true_s(t_ns))
         image, view = imager.take(t_ns, exposure, seed_of(simulation.seed, number, index), covered)
-        shot: Shot = {names[0]: image}
-        if len(names) > 1 and simulation.rig.depth is not None:
+        shot: Shot = {name: image for name in names if name != "depth0"}
+        if "depth0" in names and simulation.rig.depth is not None:
             depth = sense_depth(view.depth, simulation.rig.depth, seed_of(simulation.seed, 100 + number, index))
-            shot[names[1]] = stored_depth(depth, simulation.rig.depth)
+            shot["depth0"] = stored_depth(depth, simulation.rig.depth)
         return shot
 
     return work

@@ -32,14 +32,15 @@ def standard(
     light_rate_hz: float = 10.0,
     imu: str = "euroc",
     body_is_camera: bool = False,
+    cameras: int = 2,
 ) -> Rig:
-    """Stereo, depth registered to camera 0, an upward light camera, an IMU. Lenses scale with `size`.
+    """Stereo or one camera, depth registered to camera 0, an upward light camera, an IMU. Lenses scale with `size`.
 
     body_is_camera : the trajectory is camera 0's own, z forward, as those of RGB-D recordings are
     """
-    cameras = tuple(
+    specs = tuple(
         CameraSpec(f"cam{i}", _lens(lens, size, i), _mounted(FORWARD, (0.06, y, 0.02), i), rate_hz)
-        for i, y in enumerate((0.5 * BASELINE_M, -0.5 * BASELINE_M))
+        for i, y in enumerate((0.5 * BASELINE_M, -0.5 * BASELINE_M)[:cameras])
     )
     f = 1000.0 * light_size[0] / 1280.0
     up = Camera.create("radtan", *light_size, (f, f, 0.5 * light_size[0] - 2.3, 0.5 * light_size[1] + 1.7))
@@ -52,12 +53,12 @@ def standard(
         exposure_s=LIGHT_EXPOSURE_S,
     )
     if body_is_camera:
-        T_cam_body = cameras[0].T_body_cam.inverse()
-        cameras = tuple(replace(spec, T_body_cam=T_cam_body @ spec.T_body_cam) for spec in cameras)
+        T_cam_body = specs[0].T_body_cam.inverse()
+        specs = tuple(replace(spec, T_body_cam=T_cam_body @ spec.T_body_cam) for spec in specs)
         light = replace(light, T_body_cam=T_cam_body @ light.T_body_cam)
     return Rig(
-        cameras,
-        DepthSpec(cameras[0].camera, cameras[0].T_body_cam) if depth else None,
+        specs,
+        DepthSpec(specs[0].camera, specs[0].T_body_cam) if depth else None,
         replace(SPECS[imu]),
         light if lights else None,
     )
@@ -84,8 +85,8 @@ def _mounted(R_body_cam: Array, t: tuple[float, float, float], i: int) -> SE3:
     return SE3(R_body_cam, np.array(t)).perturbed(np.concatenate([tilt, np.zeros(3)]))
 
 
-def euroc() -> Rig:
-    """Facts of calibration of EuRoC's V1 recordings (Burri et al. 2016), with depth registered to camera 0."""
+def euroc(depth: bool = True) -> Rig:
+    """Facts of calibration of EuRoC's V1 recordings (Burri et al. 2016); depth registered to camera 0."""
     T0 = [
         [0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
         [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
@@ -102,4 +103,4 @@ def euroc() -> Rig:
         CameraSpec(f"cam{i}", Camera.create("radtan", 752, 480, *lens), SE3.from_matrix(np.array(T)), 20.0)
         for i, (lens, T) in enumerate(((lens0, T0), (lens1, T1)))
     )
-    return Rig(cameras, DepthSpec(cameras[0].camera, cameras[0].T_body_cam), ImuSpec())
+    return Rig(cameras, DepthSpec(cameras[0].camera, cameras[0].T_body_cam) if depth else None, ImuSpec())

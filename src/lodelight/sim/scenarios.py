@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -26,6 +27,7 @@ from lodelight.sim.gaits import GAITS, generate, lap_seconds
 from lodelight.sim.imu import SPECS, TURN_ON, ImuSeries, read_out
 from lodelight.sim.lightmap import bake
 from lodelight.sim.motion import Motion
+from lodelight.sim.paths import another_way
 from lodelight.sim.recorder import Simulation, record
 from lodelight.sim.space import Space
 from lodelight.types import Array
@@ -49,13 +51,15 @@ class Request:
 
     duration_s : None = LAPS of the building's route, or the whole trajectory given
     motion : cart, walk, drone or hand; None = the building's own
+    path : 0 = the building's route; any other number is a way beside it that starts elsewhere, the same for all seeds
     trajectory : file to fly instead
     place : "auto" puts the trajectory where there is most room, "x,y,z,yaw_deg" moves it; None = as it is, but "auto"
     where it starts outside the building or comes with an `imu_file`: then it was made elsewhere
     imu_file : EuRoC csv to pass through unchanged; needs `trajectory`, on the same clock
     rig : standard (body x forward, z up), camera (the body is camera 0), euroc, or a rig.toml; None = euroc for an
     EuRoC csv, else standard
-    size, rate_hz, lens, depth, lights, light_rate_hz, imu : of the standard rig; imu: euroc, phone or perfect
+    depth : of the standard and euroc rigs
+    cameras, size, rate_hz, lens, lights, light_rate_hz, imu : of the standard rig; imu: euroc, phone or perfect
     faults : as `Faults.parse` takes them
     """
 
@@ -63,12 +67,14 @@ class Request:
     seed: int = 0
     duration_s: float | None = None
     motion: str | None = None
+    path: int = 0
     standstill_s: float = 0.0
     changed: bool = False
     trajectory: str | None = None
     place: str | None = None
     imu_file: str | None = None
     rig: str | None = None
+    cameras: int = 2
     size: tuple[int, int] = (752, 480)
     rate_hz: float = 20.0
     lens: str = "radtan"
@@ -113,7 +119,9 @@ def prepare(request: Request, threads: int = 2) -> Simulation:
         series = read_out(motion, rig.imu, np.random.default_rng([request.seed, 2]), TURN_ON[request.imu])
     else:
         series = None
+    given_files = {name: _digest(name) for name in (request.trajectory, request.imu_file, request.rig) if name}
     settings = asdict(request) | {
+        "files": {name: digest for name, digest in given_files.items() if digest},
         "trajectory_deviation_m": motion.deviation_m,
         "trajectory_deviation_deg": motion.deviation_deg,
     }
@@ -154,6 +162,8 @@ def _check(request: Request) -> None:
             raise ConfigError(f"the {what} must be a positive number, got {number:g}")
     if request.standstill_s < 0.0:
         raise ConfigError(f"the standstill must not be negative, got {request.standstill_s:g} s")
+    if request.cameras not in (1, 2):
+        raise ConfigError(f"the standard rig has 1 or 2 cameras, not {request.cameras}")
     if min(request.size) < 32 or max(request.size) > 8192:
         raise ConfigError(f"the image size must lie in 32..8192, got {request.size[0]}x{request.size[1]}")
     if request.imu_file is not None and request.trajectory is None:
@@ -165,7 +175,7 @@ def _rig(request: Request) -> Rig:
     if name is None:
         name = "euroc" if request.trajectory is not None and request.trajectory.endswith(".csv") else "standard"
     if name == "euroc":
-        return rigs.euroc()
+        return rigs.euroc(request.depth)
     if name in RIGS:
         return rigs.standard(
             request.size,
@@ -176,10 +186,16 @@ def _rig(request: Request) -> Rig:
             light_rate_hz=request.light_rate_hz,
             imu=request.imu,
             body_is_camera=name == "camera",
+            cameras=request.cameras,
         )
     if not Path(name).is_file():
         raise ConfigError(f"unknown rig {name!r}; choose one of {', '.join(RIGS)}, or a rig.toml")
     return read_rig(name)
+
+
+def _digest(name: str) -> str:
+    """Of a file's bytes, to see on resuming whether it still is the same; "" where there is none of that name."""
+    return hashlib.sha256(Path(name).read_bytes()).hexdigest() if Path(name).is_file() else ""
 
 
 def _duration(request: Request) -> float:
@@ -193,7 +209,10 @@ def _route_motion(request: Request, place: Building, faults: Faults) -> Motion:
     duration_s, gait = _duration(request), GAITS[request.motion or SCENARIOS[request.scenario][1]]
     ahead = 0.0 if faults.kidnap_s is None else 0.4 * lap_seconds(gait, place.route)
     rng = np.random.default_rng([request.seed, 1])
-    motion = generate(gait, place.route, duration_s + ahead, START_NS, rng, request.standstill_s)
+    route = place.route
+    if request.path:
+        route = another_way(route, Space(place), gait, np.random.default_rng([request.path, 4]))
+    motion = generate(gait, route, duration_s + ahead, START_NS, rng, request.standstill_s)
     jump = None if faults.kidnap_s is None else (faults.kidnap_s, ahead)
     return replace(motion, duration_s=duration_s, jump=jump)
 
