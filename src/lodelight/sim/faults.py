@@ -13,11 +13,14 @@ import numpy as np
 from lodelight.errors import ConfigError
 from lodelight.rig import Rig
 from lodelight.sim.scene import Lamp
+from lodelight.sim.sensor import Exposure
 from lodelight.types import Array, Bools
 
+BLURRED_S = 0.04
 NAMES = {
     "dropped": "share of instants without images (0.2)",
     "blackout": "START:LENGTH in s during which all cameras see black (5:2)",
+    "blur": "START:LENGTH in s during which the shutter of all but the light camera stays open for 40 ms (5:2)",
     "time-offset": "seconds to add to image stamps to get the IMU's time, not told in rig.toml (0.02)",
     "extrinsics": "DEGREES:METRES by which rig.toml is wrong about every camera (1:0.01)",
     "light": "id of a light that blinks at another's frequency (L02)",
@@ -36,6 +39,7 @@ class Faults:
 
     dropped: float = 0.0
     blackout: tuple[float, float] | None = None
+    blur: tuple[float, float] | None = None
     time_offset_s: float = 0.0
     extrinsics: tuple[float, float] = (0.0, 0.0)
     light: str = ""
@@ -68,6 +72,8 @@ class Faults:
             return replace(self, dropped=share)
         if name == "blackout":
             return replace(self, blackout=_pair(value or "5:2"))
+        if name == "blur":
+            return replace(self, blur=_pair(value or "5:2"))
         if name == "time-offset":
             return replace(self, time_offset_s=float(value or 0.02))
         if name == "extrinsics":
@@ -114,6 +120,12 @@ class Faults:
     def dark(self, t_s: float) -> bool:
         """Whether the cameras are covered at a time from the start."""
         return self.blackout is not None and 0.0 <= t_s - self.blackout[0] < self.blackout[1]
+
+    def smeared(self, t_s: float, exposure: Exposure) -> Exposure:
+        """The exposure at a time from the start: in a blurred stretch as bright as it was, and much longer."""
+        if self.blur is None or not 0.0 <= t_s - self.blur[0] < self.blur[1]:
+            return exposure
+        return Exposure(BLURRED_S, exposure.gain * exposure.time_s / BLURRED_S)
 
     def true_rig(self, stated: Rig, rng: np.random.Generator) -> Rig:
         """The rig as it really is, where `stated` is what will be written down."""

@@ -172,7 +172,7 @@ def _jobs(simulation: Simulation) -> list[Job]:
             if name == "light0":
                 exposure = Exposure(spec.exposure_s, LIGHT_GAIN)
             elif kept[last]:
-                exposure = metered[last]
+                exposure = faults.smeared(imager.true_s(t), metered[last])
             else:
                 continue
             jobs.append((t, names, _shot(simulation, imager, names, t, exposure, number, index)))
