@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lodelight.estimation.bundle import BundleProblem
+from lodelight.estimation.bundle_problem import BundleProblem
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.types import Array, Bools

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lodelight.anchors import Light
@@ -9,6 +11,7 @@ from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.lights.conic import conic_centre, image_of_disc
 from lodelight.lights.modulation import Pwm
+from lodelight.lights.odometry import LightOdometry
 from lodelight.messages import LightSighting
 from lodelight.rig import CameraSpec
 from lodelight.sim.sensor import Exposure, develop
@@ -79,3 +82,54 @@ def random_pose(rng, tilt_deg=3.0):
 def measured_up(T_world_body, sigma_deg, rng):
     e = np.radians(sigma_deg) * rng.normal(size=2)
     return SE3.exp(np.array([*e, 0.0, 0.0, 0.0, 0.0])).R @ T_world_body.R[2]
+
+
+def along(truth, lights, spec, rng, rate_hz=10.0, sigma_px=0.3, tilt_deg=0.25, known=None):
+    """Fixes along a true trajectory, as light images of a clean receiver would give them.
+
+    known : the survey the receiver goes by, where it is not the truth; codes are shared where frequencies are
+    The level errs by tilt_deg, wandering over some seconds as that of an inertial sensor does.
+    """
+    odometry = LightOdometry(spec, known or lights, 2.0 * tilt_deg)
+    by_code = {}
+    for light in known or lights:
+        by_code.setdefault(light.frequency_hz, []).append(light.id)
+    tilt, keep = rng.normal(size=2), np.exp(-1.0 / (rate_hz * 2.0))
+    first, last = int(truth.t_ns[0]), int(truth.t_ns[-1])
+    fixes = []
+    for t_ns in range(first, last - 30_000_000, round(1e9 / rate_hz)):
+        seen = []
+        middle = pose_at(truth, t_ns) @ spec.T_body_cam
+        for light in lights:
+            if not _in_view(light, middle, spec, margin=0.0):
+                continue
+            rows = spec.camera.project(((middle.inverse()) @ light.xyz)[None])[0][0, 1]
+            s_ns = t_ns + round((rows * spec.row_time_s + 0.5 * spec.exposure_s) * 1e9)
+            T = pose_at(truth, s_ns)
+            if _in_view(light, T @ spec.T_body_cam, spec, margin=3.0):
+                (one,) = sightings(T, [light], rng, sigma_px, spec, [tuple(by_code[light.frequency_hz])])
+                seen.append(replace(one, t_ns=s_ns))
+        tilt = keep * tilt + np.sqrt(1.0 - keep**2) * rng.normal(size=2)
+        e = np.radians(tilt_deg) * tilt
+        up = SE3.exp(np.array([*e, 0.0, 0.0, 0.0, 0.0])).R @ pose_at(truth, t_ns).R[2]
+        fix = odometry.locate(seen, up)
+        fixes.append(replace(fix, t_ns=fix.t_ns or t_ns, seen=tuple(seen)))
+    return fixes
+
+
+def pose_at(truth, t_ns):
+    """Of a trajectory that is sampled finely."""
+    j = int(np.clip(np.searchsorted(truth.t_ns, t_ns), 1, len(truth) - 1))
+    a, b = int(truth.t_ns[j - 1]), int(truth.t_ns[j])
+    return truth.pose(j - 1).interpolate(truth.pose(j), (t_ns - a) / (b - a))
+
+
+def _in_view(light, T_world_cam, spec, margin):
+    """Whether the whole face is in the image, with so many pixels around it."""
+    X = T_world_cam.R.T @ (light.xyz - T_world_cam.t)
+    if X[2] < 0.3:
+        return False
+    px, seen = spec.camera.project(X[None])
+    edge = margin + spec.camera.focal_px * light.radius_m / X[2]
+    (u, v), w, h = px[0], spec.camera.width, spec.camera.height
+    return bool(seen[0] and edge < u < w - 1 - edge and edge < v < h - 1 - edge)

@@ -9,7 +9,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from estimator_scenes import LENSES, T_BODY_CAM, chart_error, walk
-from lodelight.estimation.bundle import BundleProblem, bundle_adjust
+from lodelight.estimation.bundle import bundle_adjust
+from lodelight.estimation.bundle_problem import BundleProblem
 from lodelight.estimation.factors.pose_prior import PosePrior
 from lodelight.geometry.se3 import SE3
 

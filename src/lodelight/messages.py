@@ -78,7 +78,8 @@ class LightFix:
     """Where the body was by the lights alone; covariance as in `Estimate`.
 
     lights : ids, of the sightings used; rms_px : of the distances between seen and expected centres
-    T_world_body None: abstained, `why` says it
+    T_world_body None : abstained, `why` says it
+    seen : every named sighting of the image, also those that no position came of
     """
 
     t_ns: int
@@ -87,6 +88,7 @@ class LightFix:
     lights: tuple[str, ...] = ()
     rms_px: float = 0.0
     why: str = ""
+    seen: tuple[LightSighting, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,7 @@ class TagSighting:
         return float(np.linalg.norm(np.roll(self.corners_px, -1, axis=0) - self.corners_px, axis=1).min())
 
 
-Message: TypeAlias = Imu | Frame
+Message: TypeAlias = Imu | Frame | LightFix
 
 
 @dataclass(frozen=True, eq=False)

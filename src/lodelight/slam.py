@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from lodelight.anchors import Anchors
 from lodelight.compiled import Stopwatch
 from lodelight.errors import ConfigError
 from lodelight.features.features import Features
@@ -15,17 +17,19 @@ from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.io.pacing import Paced
-from lodelight.io.recording import Recording
+from lodelight.io.recording import Recording, woven
 from lodelight.localization.machine import LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
 from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
+from lodelight.mapping.light_anchor import LightAnchor, LightsConfig
+from lodelight.mapping.light_gate import GateConfig
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig, adjust
 from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
-from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Message
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message
 from lodelight.rig import Rig
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
@@ -51,6 +55,8 @@ class SlamConfig:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     mapping: LocalMappingConfig = field(default_factory=LocalMappingConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
+    lights: LightsConfig = field(default_factory=LightsConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +74,7 @@ class Slam:
     `run` streams a recording; `feed` takes one message at a time, for live use; `close` waits for mapping to end.
     map : the map so far; a given one is continued
     live : mapping on its own thread; else everything is done in order, the same bytes every time
+    anchors : what is surveyed of the building; fixes by its lights come as messages
     on_event : told of every decision, as on_event(t_ns, kind, **fields), from either thread
     mapping_ms : wall time of every keyframe's mapping so far
     localization_only : set it, and the map is no longer written to
@@ -81,14 +88,16 @@ class Slam:
         gates: tuple[Gate, ...] = (),
         on_event: EventSink | None = None,
         live: bool = False,
+        anchors: Anchors | None = None,
     ) -> None:
         self.config = config or SlamConfig()
         _check_sensors(self.config.sensors, known=map is not None)
         self.map = map if map is not None else Map(rig)
-        self.gates = gates
         self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
         self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking, self.config.seed)
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
+        self.lights = _light_anchor(self.map, self.config, anchors or Anchors(), self.emit)
+        self.gates = (*gates, self.lights.ask) if self.lights and self.config.gate.use == "lights" else gates
         places = Places(self.map)
         self.machine = LocalizationMachine(self.tracker, Relocalizer(self.map, self.config.orb, places).find)
         self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
@@ -104,9 +113,14 @@ class Slam:
         self._relocalized_ns = -FOREVER_NS
         self._peak_inliers = 0  # of the frames since the last keyframe
 
-    def run(self, recording: Recording, start_s: float = 0.0, end_s: float = math.inf) -> Iterator[Estimate]:
-        """Estimates of all frames of a recording, as a robot would have had them at the time."""
-        messages = recording.messages(self.config.sensors, start_s, end_s)
+    def run(
+        self, recording: Recording, start_s: float = 0.0, end_s: float = math.inf, beside: Iterable[Message] = ()
+    ) -> Iterator[Estimate]:
+        """Estimates of all frames of a recording, as a robot would have had them at the time.
+
+        beside : further messages by rising stamp, such as fixes by lights
+        """
+        messages = woven(recording.messages(self.config.sensors, start_s, end_s), beside)
         if self.live:
             messages = iter(Paced(messages, self._dropped))
         for message in messages:
@@ -124,6 +138,8 @@ class Slam:
 
     def feed(self, message: Message) -> Estimate | None:
         """One message; an estimate for every frame."""
+        if isinstance(message, LightFix) and self.lights:
+            self.lights.feed(message)
         return self.step(message) if isinstance(message, Frame) else None
 
     def step(self, frame: Frame) -> Estimate:
@@ -133,6 +149,7 @@ class Slam:
         if len(self.map.keyframes) == 0:
             return self._begin(frame.t_ns, seen, clock)
         with self.map.lock:
+            self._move_map()
             tracked = self.machine.locate(frame.t_ns, seen)
             estimate = self._estimate(tracked, clock)
         if estimate.status == "relocalized":
@@ -142,7 +159,9 @@ class Slam:
             self.path.append(PathNode(tracked.t_ns, tracked.reference, tracked.T_reference_body))
             with self.map.lock:
                 candidate = self._candidate(tracked)
-            decision = decide(candidate, self.config.keyframes, self.gates)
+                if self.lights:
+                    self.lights.tracked(frame.t_ns, tracked.reference, tracked.T_reference_body)
+                decision = decide(candidate, self.config.keyframes, self.gates)
             self.emit(frame.t_ns, "keyframe", inserted=decision.insert, why=decision.why, weight=decision.weight)
             if decision.insert:
                 self._insert(tracked, decision)
@@ -159,7 +178,7 @@ class Slam:
         """(N, 3) m, world: the map's points."""
         return self.map.points.xyz[self.map.alive_points]
 
-    def stats(self) -> dict[str, int]:
+    def stats(self) -> dict[str, Any]:
         """Counts for `metrics.json`."""
         return {
             "keyframes": len(self.map.alive_keyframes),
@@ -167,6 +186,7 @@ class Slam:
             "loops": len(self.map.loops),
             "relocalizations": self.relocalizations,
             "dropped": self.dropped,
+            **({"gate": self.lights.gate.counts} if self.lights else {}),
         }
 
     def _dropped(self, t_ns: int) -> None:
@@ -174,6 +194,13 @@ class Slam:
         self.emit(t_ns, "dropped", why="the frames before it took too long")
 
     # -- parts --------------------------------------------------------------------------------------------------
+
+    def _move_map(self) -> None:
+        """Lay the map down where the lights say it is, while no adjustment is under way that would move it back."""
+        move = self.lights.take_move() if self.lights and self.mapping.idle else None
+        if move is not None:
+            self.map.move(move)
+            self.loops.forget()
 
     def _begin(self, t_ns: int, seen: Features, clock: Stopwatch) -> Estimate:
         """The first keyframe of a new map, at the origin, if enough of what it sees has a depth."""
@@ -187,6 +214,8 @@ class Slam:
         self._insert(first, Decision(True, "the first"))
         self.machine.start(first)
         self.path.append(PathNode(t_ns, 0, SE3.identity()))
+        if self.lights:
+            self.lights.tracked(t_ns, 0, SE3.identity())
         return self._estimate(first, clock)
 
     def _insert(self, tracked: Tracked, decision: Decision) -> None:
@@ -197,6 +226,8 @@ class Slam:
                 tracked.t_ns, tracked.T_world_body, tracked.seen, tracked.point, decision.weight, parent, tracked.noise
             )
             tracked.point[:] = self.map.points_of(keyframe)
+            if self.lights:
+                self.lights.inserted(keyframe, tracked.t_ns)
         self._last_keyframe_ns = tracked.t_ns
         self._peak_inliers = 0
         self.mapping.submit(keyframe)
@@ -230,6 +261,8 @@ class Slam:
             mapping_stopped=self.loops.correcting,
             localization_only=self.localization_only,
             queue=self.mapping.queued,
+            T_world_body=tracked.T_world_body,
+            covariance=self._covariance(tracked),
         )
 
     def _covariance(self, tracked: Tracked) -> Array:
@@ -251,3 +284,13 @@ def _check_sensors(sensors: str, known: bool) -> None:
         raise ConfigError(f"{sensors}: this version does not use the IMU; choose {sensors.removesuffix('-inertial')}")
     if sensors == "mono" and not known:
         raise ConfigError("mono alone gives a map no scale; choose rgbd or stereo, or give a map with --map")
+
+
+def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSink) -> LightAnchor | None:
+    """None where lights are not asked for. Raises ConfigError where they would be used twice."""
+    gated, tight = config.gate.use == "lights", config.lights.use == "tight"
+    if gated and tight:
+        raise ConfigError("the gate and tight lights would count the same light twice; choose --gate or --lights tight")
+    if tight and (map.rig.lights is None or not anchors.lights):
+        raise ConfigError("tight lights need a light camera in the rig and [[light]] entries in the anchors")
+    return LightAnchor(map, config.gate, config.lights, anchors.lights, emit) if gated or tight else None

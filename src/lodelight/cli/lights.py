@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from lodelight.anchors import Anchors, Light
     from lodelight.io.recording import Recording
     from lodelight.lights.plan import Plan
+    from lodelight.lights.stream import LightFrame
     from lodelight.messages import LightFix, LightSighting
     from lodelight.rig import CameraSpec
     from lodelight.types import Bytes
@@ -60,40 +61,33 @@ def decode_to_folder(
     recording: Recording, anchors: Anchors, out: Path, level: str = "imu", tilt_deg: float = 0.5,
     stripes: str = "rows", start_s: float = 0.0, end_s: float = float("inf"),
 ) -> dict[str, Any]:  # fmt: skip
-    """Read every light frame and write `trajectory.tum`, `covariance.csv`, `fixes.csv`, `sightings.csv`,
-    `metrics.json` and `frame.png`; returns what `metrics.json` holds."""
-    import time
-
+    """Read every light frame and write `trajectory.tum`, `covariance.csv`, `odometry.mcap`, `odometry.bag`,
+    `fixes.csv`, `sightings.csv`, `metrics.json` and `frame.png`; returns what `metrics.json` holds."""
     from lodelight.cli.progress import track
     from lodelight.io.covariances import write_covariances
+    from lodelight.io.odometry_bag import write_odometry
     from lodelight.io.text import write_text
     from lodelight.io.trajectories import write_tum
-    from lodelight.lights.odometry import LightOdometry
-    from lodelight.lights.receiver import receiver
     from lodelight.trajectory import Trajectory
 
-    reader = receiver(recording.rig.lights, anchors.lights, stripes)
-    odometry = LightOdometry(reader.spec, anchors.lights, tilt_deg)
     fixes: list[LightFix] = []
     rows: list[str] = []
     times_ms: list[tuple[float, float]] = []
     shown: tuple[int, Bytes | None, list[LightSighting]] = (-1, None, [])
-    for t_ns, image, up in track(_levelled(recording, level, start_s, end_s), "decoding lights"):
-        began = time.perf_counter()
-        sightings = reader.sightings(image, t_ns)
-        decoded = time.perf_counter()
-        fix = odometry.locate(sightings, up)
-        times_ms.append((1e3 * (decoded - began), 1e3 * (time.perf_counter() - decoded)))
-        fixes.append(replace(fix, t_ns=fix.t_ns or t_ns))
-        rows += [_row(t_ns, s) for s in sightings]
-        named = sum(bool(s.candidates) for s in sightings)
-        if named > shown[0]:
-            shown = (named, image, sightings)
+    frames = light_frames(recording, anchors, level, tilt_deg, stripes, start_s, end_s)
+    for frame in track(frames, "decoding lights"):
+        times_ms.append(frame.times_ms)
+        fixes.append(frame.fix)
+        rows += [_row(frame.t_ns, s) for s in frame.sightings]
+        if len(frame.fix.seen) > shown[0]:
+            shown = (len(frame.fix.seen), frame.image, frame.sightings)
     placed = [fix for fix in fixes if fix.T_world_body is not None]
     trajectory = Trajectory.from_poses([f.t_ns for f in placed], [f.T_world_body for f in placed if f.T_world_body])
     out.mkdir(parents=True, exist_ok=True)
     write_tum(out / "trajectory.tum", trajectory)
     write_covariances(out / "covariance.csv", [f.t_ns for f in placed], [f.covariance for f in placed])
+    for name in ("odometry.mcap", "odometry.bag"):
+        write_odometry(out / name, placed)
     write_text(out / "sightings.csv", HEADER + "".join(rows))
     write_text(out / "fixes.csv", "# t_ns,lights,rms_px,why\n" + "".join(map(_fix_row, fixes)))
     if shown[1] is not None:
@@ -118,22 +112,27 @@ def _fix_row(fix: LightFix) -> str:
     return f"{fix.t_ns},{' '.join(fix.lights)},{fix.rms_px:.3f},{fix.why.replace(',', ';')}\n"
 
 
-def _levelled(recording: Recording, level: str, start_s: float, end_s: float) -> Iterator[tuple[int, Bytes, Any]]:
-    """Stamp, image, and up in the body frame, of each light frame; None where the mounting is level."""
-    from lodelight.errors import SourceError
-    from lodelight.lights.level import Leveller
+def light_frames(
+    recording: Recording, anchors: Anchors, level: str = "imu", tilt_deg: float = 0.5, stripes: str = "rows",
+    start_s: float = 0.0, end_s: float = float("inf"),
+) -> Iterator[LightFrame]:  # fmt: skip
+    """Every image of a recording's light camera, read. level : "imu", or "mounting": the body's z is up.
 
+    Raises CalibrationError, ConfigError or SourceError where that cannot be done.
+    """
+    from lodelight.errors import SourceError
+    from lodelight.lights.odometry import LightOdometry
+    from lodelight.lights.receiver import receiver
+    from lodelight.lights.stream import read_lights
+
+    reader = receiver(recording.rig.lights, anchors.lights, stripes)
     if level == "imu" and recording.rig.imu is None:
         raise SourceError(
             f"{recording.path} has no IMU to level its camera by; add --level mounting if it stands level"
         )
     inertial = recording.inertial(start_s, end_s) if level == "imu" else iter(())
-    leveller, waiting = Leveller(), next(inertial, None)
-    for frame in recording.light_frames(start_s, end_s):
-        while waiting is not None and waiting.t_ns <= frame.t_ns:
-            leveller.feed(waiting)
-            waiting = next(inertial, None)
-        yield frame.t_ns, frame.images[0], leveller.up_body
+    odometry = LightOdometry(reader.spec, anchors.lights, tilt_deg)
+    return read_lights(recording.light_frames(start_s, end_s), inertial, reader, odometry)
 
 
 def _write_picture(path: Path, image: Bytes, sightings: list[LightSighting]) -> None:

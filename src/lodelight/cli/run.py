@@ -12,8 +12,12 @@ import typer
 from lodelight.cli.options import TOPIC_HELP
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from lodelight.anchors import Anchors
     from lodelight.io.recording import Recording
     from lodelight.mapping.map import Map
+    from lodelight.messages import LightFix
     from lodelight.slam import SlamConfig
 
 app = typer.Typer(add_completion=False)
@@ -25,6 +29,11 @@ def run(
     out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
     sensors: str = typer.Option("", help="stereo or rgbd; default: the most the source has."),
     rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
+    anchors: Path = typer.Option(None, help="anchors.toml: what is surveyed of the building."),
+    gate: str = typer.Option("none", help="lights: keyframes must agree with the pose by coded lights; or none."),
+    lights: str = typer.Option("off", help="tight: coded lights are part of every adjustment; or off."),
+    light_odometry: str = typer.Option("", help="Poses by lights made elsewhere, for --gate: FILE or BAG:TOPIC."),
+    light_frame: str = typer.Option("", help="Whose poses those are: body, or the light camera's name."),
     map_file: Path = typer.Option(None, "--map", help="Continue this saved map."),
     live: bool = typer.Option(False, "--live", help="Pace by the stamps, mapping on its own thread."),
     start: float = typer.Option(0.0, min=0.0, help="Seconds after the first frame."),
@@ -35,7 +44,8 @@ def run(
     as_json: bool = typer.Option(False, "--json", help="Print metrics.json."),
 ) -> None:
     """SLAM over a recording: trajectory, map and report."""
-    from lodelight.errors import RunError
+    from lodelight.errors import ConfigError, RunError
+    from lodelight.io.anchors_toml import read_anchors
     from lodelight.io.rosbag_topics import parse_roles
     from lodelight.io.sources import open_source
     from lodelight.mapping.store import load_map
@@ -43,12 +53,39 @@ def run(
     from lodelight.slam import SlamConfig
 
     recording = open_source(source, rig, parse_roles(topic))
-    config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), settings)
+    asked = [f"gate.use={gate}", f"lights.use={lights}", *settings]
+    config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), asked)
     known = load_map(map_file) if map_file else None
-    metrics = slam_to_folder(recording, out, config, known, live, start, end)
+    surveyed = read_anchors(anchors) if anchors else None
+    fixes: Iterable[LightFix] = ()
+    if config.gate.use != "none" or config.lights.use != "off":
+        again = open_source(source, rig, parse_roles(topic))
+        fixes = light_fixes(recording, again, surveyed, light_odometry, light_frame, start, end)
+    elif light_odometry:
+        raise ConfigError("--light-odometry is used by the gate; add --gate lights")
+    metrics = slam_to_folder(recording, out, config, known, live, start, end, surveyed, fixes)
     print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out))
     if metrics["tracked_fraction"] == 0.0:
         raise RunError(f"{source}: no frame could be localized; {out / 'events.jsonl'} says why")
+
+
+def light_fixes(
+    recording: Recording, again: Recording, anchors: Anchors | None, odometry: str, frame: str, start_s: float,
+    end_s: float,
+) -> Iterable[LightFix]:  # fmt: skip
+    """What the lights say, from an odometry file or from the light camera of the recording, opened a second time."""
+    from lodelight.cli.lights import light_frames
+    from lodelight.errors import ConfigError
+    from lodelight.io.light_odometry import check_clock, read_light_odometry
+
+    if odometry:
+        fixes = read_light_odometry(odometry, recording.rig, frame)
+        check_clock(fixes, recording.span_ns, odometry)
+        return fixes
+    if anchors is None:
+        raise ConfigError("lights mean nothing without their places; give --anchors FILE, or --light-odometry FILE")
+    level = "imu" if recording.rig.imu is not None else "mounting"
+    return (read.fix for read in light_frames(again, anchors, level, start_s=start_s, end_s=end_s))
 
 
 def slam_to_folder(
@@ -59,10 +96,13 @@ def slam_to_folder(
     live: bool = False,
     start_s: float = 0.0,
     end_s: float = float("inf"),
+    anchors: Anchors | None = None,
+    fixes: Iterable[LightFix] = (),
 ) -> dict[str, Any]:
     """Run SLAM over a recording and write the out folder; returns what `metrics.json` holds.
 
     known : a loaded map to continue; live : paced by the stamps
+    fixes : what lights say, by rising stamp; the config says what is made of it
     """
     import cv2
 
@@ -79,9 +119,9 @@ def slam_to_folder(
     asked = {"source": str(recording.path), "live": live, "start_s": start_s, "map": known is not None}
     with Outputs(out, {"run": asked, **as_table(config)}) as outputs, stopped_by_interrupt(recording):
         begun_s, compiled_s = time.perf_counter(), compile_seconds()
-        slam = Slam(recording.rig, config, map=known, on_event=outputs.event, live=live)
+        slam = Slam(recording.rig, config, map=known, on_event=outputs.event, live=live, anchors=anchors)
         mapped, first_ns, last_ns = 0, None, 0
-        for estimate in track(slam.run(recording, start_s, end_s), "SLAM", recording.n_frames or None):
+        for estimate in track(slam.run(recording, start_s, end_s, fixes), "SLAM", recording.n_frames or None):
             outputs.frame(estimate, estimate.details["track_ms"], sum(slam.mapping_ms[mapped:]))
             mapped = len(slam.mapping_ms)
             first_ns, last_ns = first_ns or estimate.t_ns, estimate.t_ns

@@ -14,63 +14,16 @@ import numpy as np
 from lodelight.compiled import kernel
 from lodelight.estimation import bundle_kernels
 from lodelight.estimation.block_cholesky import BlockPlan
-from lodelight.estimation.factors.pose_prior import PosePrior, add_pose_prior
+from lodelight.estimation.bundle_problem import BundleProblem, BundleResult, as_f64, observations_of
+from lodelight.estimation.factors.pose_prior import add_pose_prior
 from lodelight.estimation.factors.reprojection import TESTED_PX, TESTED_PX_DEPTH, inliers_of
 from lodelight.estimation.pose import BROAD_SIGMA_M, BROAD_SIGMA_RAD
-from lodelight.geometry.cameras import Camera
-from lodelight.geometry.se3 import SE3
 from lodelight.types import AnyArray, Array, Bools, Ints
 
 # A step that promises less than this moves all poses together by 1e-3 of their standard deviation.
 CONVERGED_CHI2 = 1e-6
+DIAGONAL = (0, 2, 5)  # of a symmetric 3x3 matrix whose lower half is stored row by row
 DAMPING_START, DAMPING_MIN, DAMPING_MAX = 1e-5, 1e-9, 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class BundleProblem:
-    """K poses, M points, N observations of one camera; nothing here is written to.
-
-    R (K, 3, 3), p (K, 3) m : T_world_body; fixed (K,) : poses that are not moved
-    xyz (M, 3) m, world; fixed_points (M,) : points that are not moved (surveyed corners); default none
-    keyframe, point (N,) : who sees what; px (N, 2), sigma_px (N,) raw pixels
-    inv_depth, sigma_inv_depth (N,) 1/m along the camera's z, inv_depth 0 = not measured
-    weight (N,) : scales what an observation says, not its test as an outlier; default 1
-
-    Without a fixed pose or a prior the result floats: damping holds it near its start.
-    """
-
-    camera: Camera
-    T_body_cam: SE3
-    R: AnyArray
-    p: AnyArray
-    fixed: AnyArray
-    xyz: AnyArray
-    keyframe: AnyArray
-    point: AnyArray
-    px: AnyArray
-    sigma_px: AnyArray
-    inv_depth: AnyArray
-    sigma_inv_depth: AnyArray
-    weight: AnyArray | None = None
-    fixed_points: AnyArray | None = None
-    priors: Sequence[PosePrior] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class BundleResult:
-    """R, p, xyz : as in the problem, adjusted
-    inliers, chi2 : (N,) in the problem's order, at the result; chi2 is unweighted, inf where not seen
-    cost : after each iteration, the start first; it may rise where the kernel is taken off or outliers leave
-    covariance : (len(covariance_of), 6, 6), chart of SE3.perturbed; zero for a fixed pose
-    """
-
-    R: Array
-    p: Array
-    xyz: Array
-    inliers: Bools
-    chi2: Array
-    cost: list[float]
-    covariance: Array
 
 
 def bundle_adjust(
@@ -126,26 +79,26 @@ class _Adjustment:
     cost: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        q = self.problem
-        n, k, m = len(q.keyframe), len(q.R), len(q.xyz)
+        q, all_ = self.problem, observations_of(self.problem)
+        n, k, m = len(all_.keyframe), len(q.R), len(all_.xyz)
         free = np.flatnonzero(~np.asarray(q.fixed, bool))
         node = np.full(k, -1, np.int32)
         node[free] = np.arange(len(free))
-        by_point = np.argsort(q.point, kind="stable")
-        self.point_start = np.searchsorted(q.point[by_point], np.arange(m + 1)).astype(np.int32)
-        self.plan = BlockPlan.of(_couplings(node[q.keyframe[by_point]], self.point_start, len(free)))
+        by_point = np.argsort(all_.point, kind="stable")
+        self.point_start = np.searchsorted(all_.point[by_point], np.arange(m + 1)).astype(np.int32)
+        self.plan = BlockPlan.of(_couplings(node[all_.keyframe[by_point]], self.point_start, len(free)))
         self.position = np.full(k, -1, np.int32)
         self.position[free] = self.plan.position
-        self.order = np.lexsort((self.position[q.keyframe], q.point))
-        weight = np.ones(n) if q.weight is None else q.weight
-        fixed_points = np.zeros(m, bool) if q.fixed_points is None else q.fixed_points
-        self.fixed_points = np.ascontiguousarray(fixed_points, bool)
-        self.keyframe = q.keyframe[self.order].astype(np.int32)
-        self.point = q.point[self.order].astype(np.int32)
-        self.px, self.sigma_px, self.inv_depth, self.sigma_inv_depth, self.weight = (
-            _f64(a[self.order]) for a in (q.px, q.sigma_px, q.inv_depth, q.sigma_inv_depth, weight)
+        self.order = np.lexsort((self.position[all_.keyframe], all_.point))
+        self.fixed_points = all_.fixed_points
+        self.lenses = all_.lenses
+        self.keyframe, self.point, self.lens = (
+            a[self.order].astype(np.int32) for a in (all_.keyframe, all_.point, all_.lens)
         )
-        self.state, self.trial = (_State(_f64(q.R).copy(), _f64(q.p).copy(), _f64(q.xyz).copy()) for _ in range(2))
+        self.px, self.sigma_px, self.inv_depth, self.sigma_inv_depth, self.weight = (
+            as_f64(a[self.order]) for a in (all_.px, all_.sigma_px, all_.inv_depth, all_.sigma_inv_depth, all_.weight)
+        )
+        self.state, self.trial = (_State(as_f64(q.R).copy(), as_f64(q.p).copy(), all_.xyz.copy()) for _ in range(2))
         self.linear, self.trial_linear = (
             _Linear(
                 np.full(n, np.inf), np.empty((k, 6, 6)), np.empty((k, 6)), np.empty((m, 6)), np.empty((m, 3)),
@@ -188,35 +141,51 @@ class _Adjustment:
             self.cost.append(self.linear.cost)
 
     def result(self, covariance_of: AnyArray | Sequence[int]) -> BundleResult:
-        n = len(self.order)
-        inliers, chi2 = np.empty(n, bool), np.empty(n)
+        n, m = len(self.problem.keyframe), len(self.problem.xyz)
+        inliers, chi2 = np.empty(len(self.order), bool), np.empty(len(self.order))
         inliers[self.order], chi2[self.order] = self.inliers, self.linear.chi2
         covariance = self._covariance(np.asarray(covariance_of, np.int32))
-        return BundleResult(self.state.R, self.state.p, self.state.xyz, inliers, chi2, self.cost, covariance)
+        at = self.state
+        return BundleResult(at.R, at.p, at.xyz[:m], inliers[:n], chi2[:n], self.cost, covariance, chi2[n:])
 
     def _linearize(self, at: _State, out: _Linear, robust: bool, before: Array) -> float:
         """Fill `out`; returns its cost as far as it can be compared with the state that had `before`."""
         q = self.problem
         out.cost, comparable = bundle_kernels.linearize(
-            q.camera.model, q.camera.params, _f64(q.T_body_cam.R), _f64(q.T_body_cam.t), at.R, at.p, at.xyz,
+            *self.lenses, self.lens, at.R, at.p, at.xyz,
             self.keyframe, self.point, self.px, self.sigma_px, self.inv_depth, self.sigma_inv_depth, self.weight,
             self.active, robust, before,
             out.chi2, out.U, out.g_pose, out.V, out.g_point, out.W,
         )  # fmt: skip
+        survey = self._add_survey(at, out)
+        out.cost += survey
+        comparable += survey
         for prior in q.priors:
             k = prior.keyframe
             extra = add_pose_prior(
                 at.R[k],
                 at.p[k],
-                _f64(prior.mean.R),
-                _f64(prior.mean.t),
-                _f64(prior.information),
+                as_f64(prior.mean.R),
+                as_f64(prior.mean.t),
+                as_f64(prior.information),
                 out.U[k],
                 out.g_pose[k],
             )
             out.cost += extra
             comparable += extra
         return comparable
+
+    def _add_survey(self, at: _State, out: _Linear) -> float:
+        """Hold the lights, the last of the points, to where they were surveyed; returns the cost."""
+        lights = self.problem.lights
+        if lights is None:
+            return 0.0
+        first = len(self.problem.xyz)
+        information = 1.0 / as_f64(lights.sigma_m) ** 2
+        off = at.xyz[first:] - lights.xyz
+        out.V[first:, DIAGONAL] += information[:, None]
+        out.g_point[first:] += information[:, None] * off
+        return float((information * (off**2).sum(axis=1)).sum())
 
     def _reduce(self, damping: float) -> bool:
         at = self.linear
@@ -258,10 +227,6 @@ class _Adjustment:
                 out[i, :, a] = self.b[position]
         symmetric: Array = 0.5 * (out + out.transpose(0, 2, 1))
         return symmetric
-
-
-def _f64(a: AnyArray) -> Array:
-    return np.ascontiguousarray(a, dtype=np.float64)
 
 
 @kernel

@@ -25,17 +25,19 @@ UNMEASURED = 1e-9
 
 @kernel
 def linearize(
-    model: int, params: Array, R_body_cam: Array, p_body_cam: Array, R: Array, p: Array, xyz: Array,
+    models: Ints, params: Array, R_body_cam: Array, p_body_cam: Array, lens: Ints, R: Array, p: Array, xyz: Array,
     keyframe: Ints, point: Ints, px: Array, sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, weight: Array,
     active: Bools, robust: bool, before: Array,
     chi2: Array, U: Array, g_pose: Array, V: Array, g_point: Array, W: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Fill chi2 (N,), U (K, 6, 6) upper half, g_pose (K, 6), V (M, 6) lower half, g_point (M, 3), W (N, 3, 6) as W^T.
 
+    lens (N,) : row of models (C,), params (C, 12), R_body_cam (C, 3, 3), p_body_cam (C, 3) that each is seen by
     Returns the cost, and the cost comparable with `before`: over the observations seen there, with those that left
     the view at the cost they had. So a step is neither rewarded for losing points nor stopped by one.
     """
     E, Rk, pk = np.zeros((2, 3)), np.empty((3, 3)), np.empty(3)
+    worn, model, lens_params, R_bc, p_bc = -1, 0, params[0], R_body_cam[0], p_body_cam[0]
     U[:] = 0.0
     g_pose[:] = 0.0
     V[:] = 0.0
@@ -43,12 +45,15 @@ def linearize(
     cost = comparable = 0.0
     for i in range(len(keyframe)):
         k, m = keyframe[i], point[i]
+        if lens[i] != worn:
+            worn = lens[i]
+            model, lens_params, R_bc, p_bc = models[worn], params[worn], R_body_cam[worn], p_body_cam[worn]
         for a in range(3):  # a copy costs less than a view, which counts its references
             pk[a] = p[k, a]
             for b in range(3):
                 Rk[a, b] = R[k, a, b]
         rows, r, Ju, Jv, Jd = reprojection(
-            model, params, Rk, pk, R_body_cam, p_body_cam, xyz[m, 0], xyz[m, 1], xyz[m, 2], px[i, 0], px[i, 1],
+            model, lens_params, Rk, pk, R_bc, p_bc, xyz[m, 0], xyz[m, 1], xyz[m, 2], px[i, 0], px[i, 1],
             sigma_px[i], inv_depth[i], sigma_inv_depth[i], E,
         )  # fmt: skip
         bound = math.inf if not robust else CHI2_PX_DEPTH if inv_depth[i] > 0.0 else CHI2_PX

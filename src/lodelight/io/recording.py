@@ -10,7 +10,7 @@ import heapq
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,6 +204,17 @@ class Recording(ABC):
         if not self.skipped:
             return f"{self.path} has no frame in the time asked for; it lasts {self.duration_s:.3f} s"
         return f"{self.path}: no frame can be used; {summarize(self.skipped)}"
+
+
+def woven(messages: Iterator[Message], beside: Iterable[Message]) -> Iterator[Message]:
+    """Both streams as one, in the order of their stamps; at one stamp what is beside comes first."""
+    try:
+        yield from heapq.merge(beside, messages, key=lambda message: message.t_ns)
+    finally:
+        for stream in (messages, beside):  # the threads that decode end with their iterators
+            close = getattr(stream, "close", None)
+            if close is not None:
+                close()
 
 
 def summarize(skipped: list[Skipped]) -> str:

@@ -7,8 +7,13 @@ Source: science note A9 (the conditions of ORB-SLAM2's NeedNewKeyFrame, as publi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
+
+import numpy as np
+
+from lodelight.geometry.se3 import SE3
+from lodelight.types import Array
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,7 @@ class Candidate:
     reference_points : of the reference keyframe, those seen often enough to be expected again
     noise : sigma of this frame's corners over a sharp frame's
     close_tracked, close_untracked : features with good depth, with and without a map point
+    T_world_body, covariance : its pose, as in `Estimate`; for gates
     """
 
     t_ns: int
@@ -59,6 +65,8 @@ class Candidate:
     queue: int = 0
     mapping_stopped: bool = False
     localization_only: bool = False
+    T_world_body: SE3 = field(default_factory=SE3.identity)
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lodelight.estimation.bundle import BundleProblem, bundle_adjust
+from lodelight.estimation.bundle import bundle_adjust
+from lodelight.estimation.bundle_problem import BundleProblem
 from lodelight.estimation.factors.reprojection import CHI2_PX
 from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
@@ -258,7 +259,8 @@ def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[
     rows = kernels.rows_of_points(points, map.points.head, map.features.next, map.points.n_obs)
     observer = map.features.keyframe[rows]
     keyframes = np.unique(np.concatenate([window, observer])).astype(np.int32)
-    fixed = ~np.isin(keyframes, window) | (map.keyframes.parent[keyframes] < 0)
+    tied = map.anchoring.holds(window)  # to the world; else the root is what the map hangs on
+    fixed = ~np.isin(keyframes, window) | (~np.bool_(tied) & (map.keyframes.parent[keyframes] < 0))
     f = map.features
     noise = map.keyframes.noise[observer]
     problem = BundleProblem(
@@ -275,6 +277,8 @@ def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[
         inv_depth=f.inv_depth[rows].astype(np.float64),
         sigma_inv_depth=noise * f.sigma_inv_depth[rows],
         weight=map.keyframes.weight[observer],
+        priors=map.anchoring.priors(keyframes, window),
+        lights=map.anchoring.views(keyframes, window),
     )
     return problem, keyframes, points, rows
 

@@ -114,6 +114,10 @@ class LoopCloser:
             self.correcting = False
         return LoopResult(loop, correction)
 
+    def forget(self) -> None:
+        """The map was laid down elsewhere: what waits for a second keyframe would move the world as it was."""
+        self._awaiting.clear()
+
     # -- belief -------------------------------------------------------------------------------------------------
 
     def _find(self, keyframe: int) -> Pair | None:

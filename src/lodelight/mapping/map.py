@@ -16,6 +16,7 @@ import numpy as np
 from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping import kernels
+from lodelight.mapping.anchoring import Anchoring
 from lodelight.mapping.table import Table
 from lodelight.rig import Rig
 from lodelight.types import AnyArray, Array, Ints
@@ -32,12 +33,14 @@ class Map:
     points    : xyz (3,) m world, desc (4,), normal (3,) mean viewing direction, d_min, d_max m (where its scale can
                 be matched), head (first feature), n_obs, n_visible, n_found, first_keyframe, replaced_by, alive
     loops     : a, b (keyframes), R (3, 3), p (3,) of the measured T_a_b
+    anchoring : what ties keyframes to the world; not saved
     lock      : held by whoever changes or reads several columns, for mapping on its own thread
     """
 
     def __init__(self, rig: Rig) -> None:
         f32, f64, i32, i64, u64 = np.float32, np.float64, np.int32, np.int64, np.uint64
         self.rig = rig
+        self.anchoring = Anchoring()
         self.lock = threading.RLock()
         self.keyframes = Table(
             t_ns=(i64, ()), R=(f64, (3, 3)), p=(f64, (3,)), weight=(f64, ()), noise=(f64, ()),
@@ -86,6 +89,18 @@ class Map:
     def set_pose(self, keyframe: int, T_world_body: SE3) -> None:
         self.keyframes.R[keyframe] = T_world_body.R
         self.keyframes.p[keyframe] = T_world_body.t
+
+    def move(self, T_new_old: SE3) -> None:
+        """Lay the whole map down elsewhere."""
+        k, p = self.keyframes, self.points
+        absolute = np.flatnonzero(k.alive | (k.parent < 0))  # culled ones are stored relative to their parents
+        k.R[absolute] = T_new_old.R @ k.R[absolute]
+        k.p[absolute] = T_new_old @ k.p[absolute]
+        turn = np.eye(6)
+        turn[3:, 3:] = T_new_old.R
+        k.covariance[:] = turn @ k.covariance @ turn.T
+        p.xyz[:] = T_new_old @ p.xyz
+        p.normal[:] = p.normal @ T_new_old.R.T
 
     def feature_range(self, keyframe: int) -> slice:
         """The feature rows of a keyframe."""

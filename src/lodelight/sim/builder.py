@@ -175,8 +175,12 @@ class Builder:
         self._lamp(Lamp(self._under(x, y, z), np.array([0.0, 0.0, -1.0]), size, luminance))
 
     def next_frequency(self) -> float:
-        """A frequency for the next coded light: all of the plan in a shuffled order, then again from the first."""
-        order = self.random("frequencies").permutation(len(FREQUENCIES_HZ))
+        """A frequency for the next coded light: all of the plan in a shuffled order, then all again in another.
+
+        In another, so that two neighbours have no second pair of neighbours with their codes.
+        """
+        again = len(self.lights) // len(FREQUENCIES_HZ)
+        order = self.random(f"frequencies {again}" if again else "frequencies").permutation(len(FREQUENCIES_HZ))
         return float(FREQUENCIES_HZ[order[len(self.lights) % len(order)]])
 
     def coded(

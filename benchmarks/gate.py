@@ -1,0 +1,120 @@
+"""What lights are worth to SLAM: `python benchmarks/gate.py RECORDINGS [--modes none,centre,chi2,patent,tight]`.
+
+RECORDINGS are folders made by `lodelight sim` (any size; `--render FOLDER` makes those of the table). The fixes are
+simulated along the truth, by the receiver's own noise as benchmarks/lights.py measured it: rendering the light camera
+would cost ten times as much. `--moved` surveys the light that is seen most 1 m off, `--swapped` swaps the two.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from light_scenes import along
+from lodelight.anchors import Anchors
+from lodelight.evaluation.ate import ate
+from lodelight.evaluation.associate import matched
+from lodelight.io.anchors_toml import read_anchors
+from lodelight.io.rig_toml import write_rig
+from lodelight.io.sources import open_source
+from lodelight.settings import with_settings
+from lodelight.sim import rigs
+from lodelight.sim.scenarios import simulate
+from lodelight.slam import Slam, SlamConfig
+
+SIZE, RATE_HZ, DURATION_S = (376, 240), 15.0, 40.0
+MODES = {
+    "none": [],
+    "centre": ["gate.use=lights"],
+    "chi2": ["gate.use=lights", "gate.mode=chi2"],
+    "patent": ["gate.use=lights", "gate.mode=patent"],
+    "only": ["gate.use=lights", "gate.anchor=false"],
+    "tight": ["lights.use=tight"],
+}
+
+
+def render(folder: Path, seeds: int) -> list[Path]:
+    """Moving boxes, three blurred seconds; one camera with depth, since nothing else is needed here."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = folder / "rig.toml"
+    write_rig(rig, rigs.standard(SIZE, RATE_HZ, lights=False).with_cameras(1))
+    made = []
+    for building in ("office", "carpark"):
+        for seed in range(seeds):
+            out = folder / f"gate_{building}_s{seed}"
+            faults = ("people=6", "blur=15:3")
+            simulate(building, out, seed=seed, duration_s=DURATION_S, rig=str(rig), faults=faults)
+            made.append(out)
+    return made
+
+
+def surveyed(lights, fixes, fault):
+    """The survey with a fault in the lights that are seen most."""
+    often = [name for name, _ in Counter(name for fix in fixes for name in fix.lights).most_common(2)]
+    if fault == "moved":
+        return tuple(replace(k, xyz=k.xyz + [1.0, 0.0, 0.0]) if k.id == often[0] else k for k in lights), often[:1]
+    by_id = {light.id: light for light in lights}
+    partner = dict(zip(often, often[::-1], strict=True))
+    return tuple(replace(k, xyz=by_id[partner[k.id]].xyz) if k.id in partner else k for k in lights), often
+
+
+def run(source: Path, mode: str, settings: list[str], end_s: float, fault: str) -> None:
+    recording = open_source(source)
+    truth = recording.ground_truth()
+    spec = rigs.standard().lights
+    rig = replace(recording.rig, lights=spec)
+    lights, told = read_anchors(source / "anchors.toml").lights, []
+    fixes = along(truth, lights, spec, np.random.default_rng(0)) if mode != "none" else []
+    if fault and fixes:
+        known, told = surveyed(lights, fixes, fault)
+        fixes, lights = along(truth, lights, spec, np.random.default_rng(0), known=known), known
+    config = with_settings(SlamConfig(sensors="rgbd"), [*MODES[mode], *settings])
+    events = []
+    slam = Slam(rig, config, anchors=Anchors(lights=lights), on_event=lambda t, kind, **f: events.append((t, kind, f)))
+    began, statuses = time.process_time(), Counter()
+    for estimate in slam.run(recording, 0.0, end_s, fixes):
+        statuses[estimate.status] += 1
+    final = slam.trajectory()
+    pairs = matched(final, truth)
+    stats = slam.stats()
+    named = sorted({f["light"] for _, kind, f in events if kind == "light_misplaced"})
+    print(
+        f"{source.name} {mode}{' ' + fault if fault else ''}: ATE se3 {ate(*pairs, 'se3').rmse_m:.4f}, "
+        f"none {ate(*pairs, 'none').rmse_m:.4f} m; {stats['keyframes']} keyframes, {statuses['lost']} lost, "
+        f"{statuses['relocalized']} relocalized, {stats['loops']} loops, gate {stats.get('gate')}"
+        + (f", told {told}, named {named}" if fault else "")
+        + f", CPU {time.process_time() - began:.0f} s",
+        flush=True,
+    )
+    for t, kind, f in events:
+        if kind in ("world", "gate_blame", "light_misplaced"):
+            print(f"    {(t - int(truth.t_ns[0])) * 1e-9:.2f} s {kind}: {f['why']}", flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--render", type=Path, help="render the recordings of the table into this folder first")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--modes", default="none,centre")
+    parser.add_argument("--set", action="append", default=[])
+    parser.add_argument("--end", type=float, default=float("inf"))
+    parser.add_argument("--moved", action="store_true")
+    parser.add_argument("--swapped", action="store_true")
+    asked = parser.parse_args()
+    sources = asked.recordings + (render(asked.render, asked.seeds) if asked.render else [])
+    for source in sources:
+        for mode in asked.modes.split(","):
+            run(source, mode, asked.set, asked.end, "moved" if asked.moved else "swapped" if asked.swapped else "")

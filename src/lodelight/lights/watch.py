@@ -1,0 +1,85 @@
+"""Does every light hang where its survey says? Rays to it from a moving camera meet where it really is."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from lodelight.anchors import Light
+from lodelight.geometry.se3 import SE3
+from lodelight.types import Array
+
+OFF_M = 0.3  # a light farther than this from its survey hangs elsewhere
+NEAR_M = 0.15  # one nearer than this is where it should be
+WITNESSES = 2  # other lights that must be in their places: else it is the map that is not
+RAYS, KEPT = 6, 40  # rays that a place is found from, and that are remembered
+PARALLAX = 0.01  # least eigenvalue of the mean of I - d d^T: rays that open by about 12 degrees
+SPREAD_M = 0.15  # rms distance of the place from its rays
+
+
+@dataclass(frozen=True, eq=False)
+class Misplaced:
+    """A light that hangs elsewhere. xyz (3,) m, world: where; other : the light that is surveyed there, or \"\"."""
+
+    light: Light
+    xyz: Array
+    other: str
+
+    @property
+    def off_m(self) -> float:
+        return float(np.linalg.norm(self.xyz - self.light.xyz))
+
+    @property
+    def why(self) -> str:
+        where = f"where {self.other} should hang" if self.other else "not where it was surveyed"
+        at = ", ".join(f"{v:.2f}" for v in self.xyz)
+        return f"light {self.light.id} hangs at {at}, {self.off_m:.2f} m from its survey, {where}"
+
+
+class LightWatch:
+    """Fed with sightings from poses that are known otherwise."""
+
+    def __init__(self, lights: dict[str, Light]) -> None:
+        self._lights = lights
+        self._rays: dict[str, deque[tuple[Array, Array]]] = {}
+        self.misplaced: dict[str, Misplaced] = {}
+
+    def forget(self) -> None:
+        """The poses so far were in another frame."""
+        self._rays.clear()
+        self.misplaced.clear()
+
+    def see(self, name: str, T_world_cam: SE3, ray_cam: Array) -> Misplaced | None:
+        """One sighting; the light, once, when it proves to hang elsewhere."""
+        rays = self._rays.setdefault(name, deque(maxlen=KEPT))
+        direction = T_world_cam.R @ ray_cam
+        rays.append((T_world_cam.t, direction / np.linalg.norm(direction)))
+        if name in self.misplaced:
+            return None
+        xyz = self._place(name)
+        if xyz is None or np.linalg.norm(xyz - self._lights[name].xyz) < OFF_M or self._witnesses(name) < WITNESSES:
+            return None
+        others = [o for o in self._lights.values() if o.id != name and np.linalg.norm(o.xyz - xyz) < OFF_M]
+        found = Misplaced(self._lights[name], xyz, others[0].id if others else "")
+        self.misplaced[name] = found
+        return found
+
+    def _place(self, name: str) -> Array | None:
+        """(3,) where a light's rays meet; None where they are few, nearly parallel, or do not meet."""
+        rays = self._rays[name]
+        if len(rays) < RAYS:
+            return None
+        centres, directions = np.array([c for c, _ in rays]), np.array([d for _, d in rays])
+        across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+        normal = across.mean(axis=0)
+        if np.linalg.eigvalsh(normal)[0] < PARALLAX:
+            return None
+        xyz: Array = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres) / len(rays))
+        off = np.einsum("nij,nj->ni", across, xyz - centres)
+        return xyz if np.sqrt((off**2).sum(axis=1).mean()) < SPREAD_M else None
+
+    def _witnesses(self, name: str) -> int:
+        places = [(self._lights[o], self._place(o)) for o in self._rays if o != name and o not in self.misplaced]
+        return sum(xyz is not None and bool(np.linalg.norm(xyz - o.xyz) < NEAR_M) for o, xyz in places)
