@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from light_scenes import along
 from lodelight.anchors import Anchors
-from lodelight.evaluation.ate import ate
 from lodelight.evaluation.associate import matched
+from lodelight.evaluation.ate import ate
 from lodelight.io.anchors_toml import read_anchors
 from lodelight.io.rig_toml import write_rig
 from lodelight.io.sources import open_source
@@ -64,7 +64,9 @@ def surveyed(lights, fixes, fault):
     """The survey with a fault in the lights that are seen most."""
     often = [name for name, _ in Counter(name for fix in fixes for name in fix.lights).most_common(2)]
     if fault == "moved":
-        return tuple(replace(k, xyz=k.xyz + [1.0, 0.0, 0.0]) if k.id == often[0] else k for k in lights), often[:1]
+        return tuple(
+            replace(k, xyz=k.xyz + np.array([1.0, 0.0, 0.0])) if k.id == often[0] else k for k in lights
+        ), often[:1]
     by_id = {light.id: light for light in lights}
     partner = dict(zip(often, often[::-1], strict=True))
     return tuple(replace(k, xyz=by_id[partner[k.id]].xyz) if k.id in partner else k for k in lights), often

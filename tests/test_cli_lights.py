@@ -59,7 +59,8 @@ def test_decode_writes_where_the_body_was(recording, tmp_path, capsys):
     # Level to 1e-4 and 0.05 px of 2.3 m: a millimetre or two
     np.testing.assert_allclose(path.xyz, [[0.1, -0.05, 0.2]] * 3, atol=3e-3)
     assert {p.name for p in out.iterdir()} == {
-        "trajectory.tum", "covariance.csv", "fixes.csv", "sightings.csv", "metrics.json", "frame.png",
+        "trajectory.tum", "covariance.csv", "odometry.mcap", "odometry.bag", "fixes.csv", "sightings.csv",
+        "metrics.json", "frame.png",
     }  # fmt: skip
 
 

@@ -29,10 +29,7 @@ NODES = 64  # frames that are remembered, to know where the body was when a ligh
 NODE_GAP_S = 0.25
 PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
-FLOOR_RAD, FLOOR_M = (
-    math.radians(0.2),
-    0.01,
-)  # of a pose by the lights: neighbours share the errors of survey and mounting
+FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
 NOT_YET = "the map has no place in the world yet"
 
 
