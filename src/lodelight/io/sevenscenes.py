@@ -18,7 +18,7 @@ from lodelight.io.listing import ListedRecording, Listing
 from lodelight.io.schema import rigid_motion
 from lodelight.io.stamps import NS_PER_S
 from lodelight.io.text import fields, lines
-from lodelight.rig import CameraSpec, DepthSpec, Rig
+from lodelight.rig import KINECT_ROW_TIME_S, CameraSpec, DepthSpec, Rig
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
 
@@ -58,7 +58,8 @@ def open_sevenscenes(path: Path, rig: Rig | None) -> ListedRecording:
 
 
 def _built_in_rig(path: Path) -> Rig:
-    color = CameraSpec("cam0", Camera.create("radtan", 640, 480, COLOR_LENS), SE3.identity(), rate_hz=float(RATE_HZ))
+    lens = Camera.create("radtan", 640, 480, COLOR_LENS)
+    color = CameraSpec("cam0", lens, SE3.identity(), rate_hz=float(RATE_HZ), row_time_s=KINECT_ROW_TIME_S)
     depth = DepthSpec(_depth_lens(path), T_COLOR_DEPTH, units_per_m=1000.0, registered=False)
     return Rig((color,), depth=depth)
 

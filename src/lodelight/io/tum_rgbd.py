@@ -15,7 +15,7 @@ from lodelight.io.listing import ListedRecording, Listing, bad_rows
 from lodelight.io.stamps import associate, ns_from_seconds
 from lodelight.io.text import read_files, read_text
 from lodelight.io.trajectories import read_trajectory
-from lodelight.rig import CameraSpec, DepthSpec, Rig
+from lodelight.rig import KINECT_ROW_TIME_S, CameraSpec, DepthSpec, Rig
 from lodelight.trajectory import Trajectory
 
 FORMAT = "tum_rgbd"
@@ -63,8 +63,9 @@ def _built_in_rig(path: Path) -> Rig:
             f"{path} does not say which freiburg camera took it; put a rig.toml there or give --rig FILE"
         )
     camera = Camera.create("radtan", 640, 480, *LENSES[found[1]])
+    row_time_s = 0.0 if found[1] == "3" else KINECT_ROW_TIME_S  # the third was an Asus Xtion
     depth = DepthSpec(camera, SE3.identity(), units_per_m=UNITS_PER_M)
-    return Rig((CameraSpec("cam0", camera, SE3.identity()),), depth=depth)
+    return Rig((CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s),), depth=depth)
 
 
 def _comment_files(path: Path) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,12 +11,16 @@ from lodelight.estimation.pose import PoseResult, optimize_pose
 from lodelight.features.features import Features
 from lodelight.features.matching import FeatureIndex, consistent_turn, match_descriptors
 from lodelight.features.orb import OrbConfig
+from lodelight.features.shutter import STILL, Shutter
 from lodelight.geometry.pnp import ransac_pnp
 from lodelight.geometry.se3 import SE3
+from lodelight.localization.tracked import Fit, Landmarks, Tracked, TrackerConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import Sight, in_sight, local_keyframes, points_of_keyframes
 from lodelight.rig import Rig
-from lodelight.types import AnyArray, Array, ArrayF32, Bools, Ints, Words
+from lodelight.types import AnyArray, Array, Bools, Ints, Words
+
+__all__ = ["Fit", "Landmarks", "Tracked", "Tracker", "TrackerConfig"]
 
 MAX_DEPTH_RATIO = 0.5  # a prediction of where things are is not wrong by half of their depth
 MIN_DEPTH_M = 0.1
@@ -26,70 +29,8 @@ MEDIAN_CHI2_2, MEDIAN_CHI2_3 = 1.386, 2.366  # of a chi-square distribution with
 SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it counts as sharp; more is a failure
 INLIERS = 0.95  # of right matches, which pass their test
 CHANCE_SIGMA = 3.0  # of the binomial distribution of those that agree by chance: so many are put down to it
+UNROLLINGS, SETTLED_PX = 3, 0.5  # of a rolling shutter: at most so many, until rows are moved by less than that
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
-
-
-@dataclass(frozen=True)
-class TrackerConfig:
-    """sigma_px : noise of a corner at the finest octave
-    search_px : how far a corner may be from where the motion model puts it, at the finest octave
-    min_matches : fewer that fit a pose, and the next way of matching is tried
-    min_inliers : fewer after the local map, and the frame is lost; good_inliers : fewer, and it is degraded
-    """
-
-    sigma_px: float = 1.0
-    search_px: float = 15.0
-    min_matches: int = 20
-    min_inliers: int = 15
-    good_inliers: int = 40
-
-
-@dataclass(eq=False)
-class Tracked:
-    """A frame and what it was matched with.
-
-    point : (N,) map point of every feature, -1 = none; inliers only
-    reference : the keyframe that sees most of those points; noise : sigma of its corners over a sharp frame's
-    temporary : (N,) temporary point of every feature, -1 = none; None where there are no such points
-    """
-
-    t_ns: int
-    seen: Features
-    T_world_body: SE3
-    covariance: Array
-    point: Ints
-    reference: int
-    noise: float = 1.0
-    why_lost: str = ""
-    T_reference_body: SE3 = field(default_factory=SE3.identity)
-    temporary: Ints | None = None
-
-    @property
-    def n_inliers(self) -> int:
-        return int(np.count_nonzero(self.point >= 0))
-
-
-@dataclass(frozen=True, eq=False)
-class Landmarks:
-    """Things to match with: map point (M,) or -1, position (M, 3) m world, and how a feature of it looked."""
-
-    point: Ints
-    xyz: Array
-    desc: Words
-    octave: Ints
-    angle: ArrayF32
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A pose from matches. point : (N,) map point of every feature that agrees, or -1; tried : matches there were;
-    right : how many of them are at least, going by how many more agree than would by chance
-    """
-
-    solved: PoseResult
-    point: Ints
-    tried: int
-    right: float
 
 
 class Tracker:
@@ -102,6 +43,7 @@ class Tracker:
         self.seed = seed
         self.camera = rig.cameras[0].camera
         self.T_body_cam = rig.cameras[0].T_body_cam
+        self.shutter = Shutter(rig.cameras[0])
         self.last: Tracked | None = None
         self._motion: tuple[SE3, int] | None = None  # T_previous_last and the time it took, ns
 
@@ -117,6 +59,8 @@ class Tracker:
         last = self.last
         T_world_last = self._moved_with_map(last)
         predicted = self._predict(T_world_last, t_ns)
+        twist = self._twist()
+        seen = self.shutter.straightened(seen, twist)
         index = FeatureIndex(seen, self.camera.width, self.camera.height)
         recent = self._landmarks_of_frame(last, T_world_last)
         pairs = self._match_predicted(recent, predicted, index)
@@ -129,7 +73,13 @@ class Tracker:
                     break
         if fit.right < self.config.min_matches:
             return self._lost(t_ns, seen, predicted, f"{fit.solved.n_inliers} of {fit.tried} matches fit one pose")
-        return self.refine(t_ns, seen, fit.solved.T_world_body, fit.point, index, search=3.0)
+        T_world_body = fit.solved.T_world_body
+        if self.shutter.rolls:
+            seen, twist, T_world_body = self._unrolled(seen, twist, fit)
+            index = FeatureIndex(seen, self.camera.width, self.camera.height)
+        tracked = self.refine(t_ns, seen, T_world_body, fit.point, index, search=3.0)
+        tracked.twist = twist
+        return tracked
 
     def refine(
         self, t_ns: int, seen: Features, T_world_body: SE3, point: Ints, index: FeatureIndex, search: float
@@ -183,6 +133,23 @@ class Tracker:
         point[match[match >= 0]] = sight.point[new][match >= 0]
         return point
 
+    def _unrolled(self, seen: Features, twist: Array, fit: Fit) -> tuple[Features, Array, SE3]:
+        """A frame of a rolling shutter straightened by the turn that its own rows show; its twist and its pose."""
+        used, T_world_body = np.flatnonzero(fit.point >= 0), fit.solved.T_world_body
+        xyz = self.map.points.xyz[fit.point[used]]
+        for _ in range(UNROLLINGS):
+            solved, noise = self._solve(T_world_body, seen.take(used), xyz)
+            T_world_body, right = solved.T_world_body, used[solved.inliers]
+            if len(right) < self.config.min_matches:
+                break
+            xyz_cam = (T_world_body @ self.T_body_cam).inverse() @ xyz[solved.inliers]
+            sigma_px = noise * self._sigma_px(seen.take(right))
+            more = np.append(self.shutter.turn_left_over(seen.px[right], sigma_px, xyz_cam), np.zeros(3))
+            seen, twist = self.shutter.straightened(seen, more), twist + more
+            if self.shutter.reach_px(more) < SETTLED_PX:
+                break
+        return seen, twist, T_world_body
+
     def _moved_with_map(self, frame: Tracked) -> SE3:
         """T_world_body of a past frame, as its reference keyframe has been corrected since."""
         return self.map.pose(frame.reference) @ frame.T_reference_body
@@ -194,6 +161,15 @@ class Tracker:
         T_previous_last, dt_ns = self._motion
         share = (t_ns - self.last.t_ns) / dt_ns
         return T_world_last @ SE3.exp(share * T_previous_last.log())
+
+    def _twist(self) -> Array:
+        """(6,) rad/s and m/s in the camera's frame: the turn that the last frame's rows showed, the velocity it had."""
+        if not self.shutter.rolls or self._motion is None or self.last is None:
+            return STILL
+        T_previous_last, dt_ns = self._motion
+        T_cam_cam = self.T_body_cam.inverse() @ T_previous_last @ self.T_body_cam
+        velocity = T_cam_cam.log() / (dt_ns * 1e-9)
+        return np.append(self.last.twist[:3] if np.any(self.last.twist) else velocity[:3], velocity[3:])
 
     def _landmarks_of_frame(self, frame: Tracked, T_world_body: SE3) -> Landmarks:
         """What a frame saw: its map points, and features with a depth but no map point, put where that depth says."""
