@@ -22,8 +22,12 @@ from lodelight.geometry.dense import inverse3, matmul, transposed
 from lodelight.geometry.so3 import so3_exp, so3_log, so3_perturbed
 from lodelight.types import Array, Bools, Ints
 
-# Added to the information of every inverse depth, (1/m)^-2: what is known of any point indoors, 2 1/m either way
-FLOOR_INV_DEPTH = 0.25
+# What is known of any point indoors, as a mean and a sigma of its inverse depth, 1/m. It keeps points that are seen
+# under no parallax from falling into the camera while a start is still unsure of its speed.
+USUAL_INV_DEPTH, SIGMA_INV_DEPTH = 0.3, 1.0
+# No point is farther, and none lies beyond infinity: a scene seen the wrong way round, with the motion turned about,
+# fits the images as well while the IMU is unsure.
+LEAST_INV_DEPTH = 0.005
 
 
 @kernel
@@ -181,7 +185,11 @@ def visual_terms(
                 g_landmark[m, 0] += l0 * r[row]
                 g_landmark[m, 1] += l1 * r[row]
                 g_landmark[m, 2] += l2 * r[row]
-        V_out[m, 5] += FLOOR_INV_DEPTH
+        unusual = (landmark[m, 2] - USUAL_INV_DEPTH) / SIGMA_INV_DEPTH
+        V_out[m, 5] += 1.0 / (SIGMA_INV_DEPTH * SIGMA_INV_DEPTH)
+        g_landmark[m, 2] += unusual / SIGMA_INV_DEPTH
+        cost += unusual * unusual
+        comparable += unusual * unusual
     return cost, comparable
 
 
@@ -477,7 +485,7 @@ def step(
         gain -= g_landmark[m, 0] * d0 + g_landmark[m, 1] * d1 + g_landmark[m, 2] * d2
         landmark_new[m, 0] = landmark[m, 0] + d0
         landmark_new[m, 1] = landmark[m, 1] + d1
-        landmark_new[m, 2] = landmark[m, 2] + d2
+        landmark_new[m, 2] = max(landmark[m, 2] + d2, LEAST_INV_DEPTH)
     return gain
 
 
