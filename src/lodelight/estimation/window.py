@@ -19,7 +19,7 @@ from lodelight.estimation.marginalization import Key, Prior
 from lodelight.estimation.window_build import build, store
 from lodelight.estimation.window_frames import Seen, SeenTag, WindowFrame, pose_of, pose_row, row_of
 from lodelight.estimation.window_leave import forget_tags, marginalize_oldest
-from lodelight.estimation.window_problem import Belief, Problem
+from lodelight.estimation.window_problem import CONVERGED_CHI2, SETTLED_CHI2, Belief, Problem
 from lodelight.estimation.window_tags import TagStates
 from lodelight.estimation.window_types import (
     Departed,
@@ -165,13 +165,14 @@ class Window:
         newest = self.frames[-1]
         doubtful = [s for s in newest.tags if not s.tested and self.tag_states.is_known(s.view.id)]
         problem, rows = build(self, without=doubtful)
-        taken = problem.minimize(most)
+        enough = SETTLED_CHI2 if newest.keyframe else CONVERGED_CHI2
+        taken = problem.minimize(most, enough)
         if taken >= 0 and doubtful:
             self.tag_states.test(problem, doubtful, self.config.tag_gate_chi2)
             if any(s.use for s in doubtful):
                 store(self, problem, rows)
                 problem, rows = build(self)
-                taken = problem.minimize(most)
+                taken = problem.minimize(most, enough)
         n = len(problem.sightings)
         if taken < 0:
             return Solution(False, np.inf, 0, n, 0, np.zeros(0, np.int64))

@@ -76,18 +76,12 @@ def visual_terms(
     """
     Ri, pi, Rj, pj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     Li, li, Lj, lj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
-    Rc, pc = np.empty((len(models), 3, 3)), np.empty((len(models), 3))
-    Rc_lin, pc_lin = np.empty((len(models), 3, 3)), np.empty((len(models), 3))
+    Rci, pci, Rcj, pcj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    Lci, lci, Lcj, lcj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    here, place, lens = np.empty((3, 3)), np.empty(3), np.empty(params.shape[1])
     r, E, J = np.zeros(3), np.empty((2, 3)), np.empty((3, 27))
-    compact, column = np.empty((3, 26)), np.empty(26, np.int64)
-    lens = np.empty((len(models), params.shape[1]))
-    for c in range(len(models)):
-        for a in range(params.shape[1]):
-            lens[c, a] = params[c, a]
-        for a in range(3):
-            pc[c, a], pc_lin[c, a] = mount[c, 9 + a], mount_lin[c, 9 + a]
-            for b in range(3):
-                Rc[c, a, b], Rc_lin[c, a, b] = mount[c, 3 * a + b], mount_lin[c, 3 * a + b]
+    compact, column = np.zeros((3, 26)), np.empty(26, np.int64)
+    still = np.zeros((mount.shape[0], 6))
     V_out[:] = 0.0
     g_landmark[:] = 0.0
     W[:] = 0.0
@@ -98,12 +92,23 @@ def visual_terms(
         tau_i = offset_s + shift_s[first]
         load_pose(x, anchor, motion, tau_i, Ri, pi)
         load_pose(lin, anchor, motion, tau_i, Li, li)
+        load_pose(mount, ci, still, 0.0, Rci, pci)
+        load_pose(mount_lin, ci, still, 0.0, Lci, lci)
+        for a in range(3):  # a copy costs less than a view, which counts its references
+            place[a] = landmark[m, a]
+            for b in range(3):
+                here[a, b] = base[m, a, b]
         for o in range(first, start[m + 1]):
             j, cj = frame[o], camera[o]
             tau_j = offset_s + shift_s[o]
             load_pose(x, j, motion, tau_j, Rj, pj)
+            load_pose(lin, j, motion, tau_j, Lj, lj)
+            load_pose(mount, cj, still, 0.0, Rcj, pcj)
+            load_pose(mount_lin, cj, still, 0.0, Lcj, lcj)
+            for a in range(len(lens)):
+                lens[a] = params[cj, a]
             rows = inverse_depth_residual(
-                models[cj], lens[cj], Ri, pi, Rc[ci], pc[ci], Rj, pj, Rc[cj], pc[cj], base[m], landmark[m],
+                models[cj], lens, Ri, pi, Rci, pci, Rj, pj, Rcj, pcj, here, place,
                 px[o, 0], px[o, 1], sigma_px[o], inv_depth[o], sigma_inv_depth[o], r,
             )  # fmt: skip
             value = weight = 0.0
@@ -111,10 +116,9 @@ def visual_terms(
             if rows > 0:
                 chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
                 value, weight = fading(chi2[o], bound) if robust else (chi2[o], 1.0)
-                load_pose(lin, j, motion, tau_j, Lj, lj)
                 if not inverse_depth_jacobian(
-                    models[cj], lens[cj], Li, li, Rc_lin[ci], pc_lin[ci], Lj, lj, Rc_lin[cj], pc_lin[cj], base[m],
-                    landmark[m], sigma_px[o], inv_depth[o], sigma_inv_depth[o], E, J,
+                    models[cj], lens, Li, li, Lci, lci, Lj, lj, Lcj, lcj, here, place,
+                    sigma_px[o], inv_depth[o], sigma_inv_depth[o], E, J,
                 ):  # fmt: skip
                     rows = 0
             if rows == 0:
@@ -136,15 +140,16 @@ def visual_terms(
                     _turned_back(J, 6, motion, j, tau_j)
                 for a in range(6):
                     column[a], column[6 + a] = pose_at + 6 * anchor + a, pose_at + 6 * j + a
-                    for row in range(rows):
-                        compact[row, a], compact[row, 6 + a] = J[row, a], J[row, 6 + a]
+                for row in range(3):
+                    for a in range(12):
+                        compact[row, a] = J[row, a]
                 n = 12
             # at the anchor's own pixel neither poses nor mountings have a say
             if mount_at >= 0 and o != first:
                 low, high = min(ci, cj), max(ci, cj)
                 for a in range(6):
                     column[n + a] = mount_at + 6 * low + a
-                    for row in range(rows):
+                    for row in range(3):
                         compact[row, n + a] = J[row, (15 if low == ci else 21) + a]
                         if low == high:
                             compact[row, n + a] += J[row, 21 + a]
@@ -152,39 +157,35 @@ def visual_terms(
                 if low != high:
                     for a in range(6):
                         column[n + a] = mount_at + 6 * high + a
-                        for row in range(rows):
+                        for row in range(3):
                             compact[row, n + a] = J[row, (15 if high == ci else 21) + a]
                     n += 6
             if offset_at >= 0 and j != anchor:
                 column[n] = offset_at
-                for row in range(rows):
+                for row in range(3):
                     s = 0.0
                     for a in range(3):
                         s += compact[row, a] * motion[anchor, a] + compact[row, 3 + a] * motion[anchor, 3 + a]
                         s += compact[row, 6 + a] * motion[j, a] + compact[row, 9 + a] * motion[j, 3 + a]
                     compact[row, n] = s
                 n += 1
-            for row in range(rows):
-                wr = weight * r[row]
-                for a in range(n):
-                    wj = weight * compact[row, a]
-                    g[column[a]] += wr * compact[row, a]
-                    for b in range(a, n):
-                        H[column[a], column[b]] += wj * compact[row, b]
-                    at = column[a] - pose_at
-                    W[m, 0, at] += wj * J[row, 12]
-                    W[m, 1, at] += wj * J[row, 13]
-                    W[m, 2, at] += wj * J[row, 14]
-                l0, l1, l2 = weight * J[row, 12], weight * J[row, 13], weight * J[row, 14]
-                V_out[m, 0] += l0 * J[row, 12]
-                V_out[m, 1] += l1 * J[row, 12]
-                V_out[m, 2] += l1 * J[row, 13]
-                V_out[m, 3] += l2 * J[row, 12]
-                V_out[m, 4] += l2 * J[row, 13]
-                V_out[m, 5] += l2 * J[row, 14]
-                g_landmark[m, 0] += l0 * r[row]
-                g_landmark[m, 1] += l1 * r[row]
-                g_landmark[m, 2] += l2 * r[row]
+            for a in range(n):
+                j0, j1, j2 = weight * compact[0, a], weight * compact[1, a], weight * compact[2, a]
+                at = column[a]
+                g[at] += j0 * r[0] + j1 * r[1] + j2 * r[2]
+                for b in range(a, n):
+                    H[at, column[b]] += j0 * compact[0, b] + j1 * compact[1, b] + j2 * compact[2, b]
+                at -= pose_at
+                W[m, 0, at] += j0 * J[0, 12] + j1 * J[1, 12] + j2 * J[2, 12]
+                W[m, 1, at] += j0 * J[0, 13] + j1 * J[1, 13] + j2 * J[2, 13]
+                W[m, 2, at] += j0 * J[0, 14] + j1 * J[1, 14] + j2 * J[2, 14]
+            slot = 0
+            for a in range(3):
+                j0, j1, j2 = weight * J[0, 12 + a], weight * J[1, 12 + a], weight * J[2, 12 + a]
+                g_landmark[m, a] += j0 * r[0] + j1 * r[1] + j2 * r[2]
+                for b in range(a + 1):
+                    V_out[m, slot] += j0 * J[0, 12 + b] + j1 * J[1, 12 + b] + j2 * J[2, 12 + b]
+                    slot += 1
         unusual = (landmark[m, 2] - USUAL_INV_DEPTH) / SIGMA_INV_DEPTH
         V_out[m, 5] += 1.0 / (SIGMA_INV_DEPTH * SIGMA_INV_DEPTH)
         g_landmark[m, 2] += unusual / SIGMA_INV_DEPTH
@@ -396,20 +397,27 @@ def eliminate_landmarks(
 def factor_rows(S: Array) -> bool:
     """The upper half of S (n, n) becomes U with S = U^T U; False where it is not positive definite.
 
-    By rows, each subtracted from those below where it couples: zeros are skipped and the inner loop runs along memory.
+    By rows, three at a time subtracted from those below: zeros are skipped and the inner loop runs along memory.
     """
     n = S.shape[0]
-    for k in range(n):
-        if not S[k, k] > 0.0:
-            return False
-        inverse = 1.0 / math.sqrt(S[k, k])
-        for j in range(k, n):
-            S[k, j] *= inverse
-        for i in range(k + 1, n):
-            f = S[k, i]
-            if f != 0.0:
+    for k in range(0, n, 3):
+        end = min(k + 3, n)
+        for a in range(k, end):
+            for r in range(k, a):
+                f = S[r, a]
+                if f != 0.0:
+                    for j in range(a, n):
+                        S[a, j] -= f * S[r, j]
+            if not S[a, a] > 0.0:
+                return False
+            inverse = 1.0 / math.sqrt(S[a, a])
+            for j in range(a, n):
+                S[a, j] *= inverse
+        for i in range(end, n):  # only where there are three
+            f0, f1, f2 = S[k, i], S[k + 1, i], S[k + 2, i]
+            if f0 != 0.0 or f1 != 0.0 or f2 != 0.0:
                 for j in range(i, n):
-                    S[i, j] -= f * S[k, j]
+                    S[i, j] -= f0 * S[k, j] + f1 * S[k + 1, j] + f2 * S[k + 2, j]
     return True
 
 
