@@ -63,17 +63,18 @@ def scene(
     points: int = 700,
     tags: int = 0,
     standstill_s: float = 0.0,
+    begin_s: float = 2.5,
     lens: str = "radtan",
     **options: float,
 ) -> Scene:
     rng = np.random.default_rng(seed)
     rig = standard(imu=imu, lens=lens).with_cameras(cameras)
-    motion = generate(GAITS[gait], FLOOR_PLAN, duration_s + 1.0, 1_000_000_000, rng, standstill_s)
+    motion = generate(GAITS[gait], FLOOR_PLAN, begin_s + duration_s + 1.0, 1_000_000_000, rng, standstill_s)
     spec = rig.imu
     assert spec is not None
     series = read_out(motion, spec, rng, (0.02, 0.05) if imu == "euroc" else (0.0, 0.0))
     step = round(1e9 / rate_hz)
-    frame_ns = motion.start_ns + 100_000_000 + step * np.arange(int(duration_s * rate_hz)) + 1_234_567
+    frame_ns = motion.start_ns + round(begin_s * 1e9) + step * np.arange(int(duration_s * rate_hz)) + 1_234_567
     wall = rng.integers(0, 6, points)
     xyz = rng.uniform(0.0, 1.0, (points, 3)) * ROOM
     xyz[np.arange(points), wall // 2] = (wall % 2) * ROOM[wall // 2]
@@ -161,7 +162,8 @@ def state_error(estimate: NavState, truth: NavState) -> Array:
     ])  # fmt: skip
 
 
-START = StartSigma(tilt_rad=0.02, velocity_m_s=0.1, bias_gyro=0.01, bias_accel=0.05)
+# What an initialization in motion gives
+START = StartSigma(tilt_rad=0.01, velocity_m_s=0.05, bias_gyro=0.003, bias_accel=0.05)
 
 
 @dataclass(eq=False)

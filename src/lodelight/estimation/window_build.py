@@ -17,7 +17,8 @@ from lodelight.types import AnyArray, Array, Bools, Ints
 if TYPE_CHECKING:
     from lodelight.estimation.window import Window
 
-DEFAULT_INV_DEPTH = 0.3  # 1/m, of a landmark whose parallax says nothing yet and that has no neighbours
+DEFAULT_INV_DEPTH = 0.3  # 1/m, of points of which nothing is known
+MANY = 10  # landmarks of sure depth tell what is usual
 
 
 @dataclass(eq=False)
@@ -52,7 +53,7 @@ def build(window: Window, without: Collection[SeenTag] = (), leaving: Leaving | 
     lin = np.array([f.x if f.lin is None else f.lin for f in frames])
     motion = np.hstack([np.array([f.omega for f in frames]), x[:, 12:15]])
     models = np.array([c.camera.model for c in window.cameras], np.int32)
-    base, landmark = _placed(window, s, x, motion, models)
+    base, landmark, usual = _placed(window, s, x, motion, models)
     tags, states = window.tag_states, window.tag_states.states
     views = [
         (i, v) for i, f in enumerate(frames) for v in f.tags
@@ -98,6 +99,7 @@ def build(window: Window, without: Collection[SeenTag] = (), leaving: Leaving | 
         calibrate_offset=("offset", 0) in window.beliefs,
         sightings=s,
         base=base,
+        usual_inv_depth=usual,
         active=active,
         tag_sightings=tag_sightings,
         measured=np.array([f.measured for f in frames[1:]]).reshape(F - 1, -1),
@@ -105,6 +107,7 @@ def build(window: Window, without: Collection[SeenTag] = (), leaving: Leaving | 
         use_imu=use_imu,
         still_sigma=still,
         prior=window.prior,
+        first_estimates=leaving is not None,
         beliefs=_beliefs(window, numbers, leaving is not None),
     )
     return problem, Rows(frame_of, row_of)
@@ -134,21 +137,21 @@ def _chosen(s: Sightings, kept: Bools, landmarks: Bools, count: AnyArray) -> Sig
     return Sightings(s.track[landmarks], start, *(np.ascontiguousarray(getattr(s, name)[kept]) for name in columns))
 
 
-def _placed(window: Window, s: Sightings, x: Array, motion: Array, models: Ints) -> tuple[Array, Array]:
-    """Base (M, 3, 3) and landmark (M, 3): where they were, or triangulated."""
+def _placed(window: Window, s: Sightings, x: Array, motion: Array, models: Ints) -> tuple[Array, Array, float]:
+    """Base (M, 3, 3) and landmark (M, 3), where they were or triangulated, and the inverse depth usual here."""
     M = len(s.track)
     at = np.searchsorted(window.landmark_track, s.track)
     at = np.minimum(at, max(len(window.landmark_track) - 1, 0))
     known = window.landmark_track[at] == s.track if len(window.landmark_track) else np.zeros(M, bool)
     world = window.landmark_world[at] if len(window.landmark_track) else np.zeros((M, 4))
-    usual = window.landmark_inv_depth[window.landmark_inv_depth > 0.0]
-    default = float(np.median(usual)) if len(usual) else DEFAULT_INV_DEPTH
+    sure = window.landmark_sigma < 0.5 * window.landmark_inv_depth
+    usual = float(np.median(window.landmark_inv_depth[sure])) if sure.sum() >= MANY else DEFAULT_INV_DEPTH
     base, landmark, parallax = np.empty((M, 3, 3)), np.empty((M, 3)), np.empty(M)
     kernels.place_landmarks(
         x, motion, models, window.mounts, float(window.offset_s[0]), s.rays, s.start, s.frame, s.camera, s.inv_depth,
-        s.shift_s, world, known, default, base, landmark, parallax,
+        s.shift_s, world, known, usual, base, landmark, parallax,
     )  # fmt: skip
-    return base, landmark
+    return base, landmark, usual
 
 
 def store(window: Window, problem: Problem, rows: Rows) -> Bools:

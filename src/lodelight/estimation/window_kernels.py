@@ -22,9 +22,9 @@ from lodelight.geometry.dense import inverse3, matmul, transposed
 from lodelight.geometry.so3 import so3_exp, so3_log, so3_perturbed
 from lodelight.types import Array, Bools, Ints
 
-# What is known of any point indoors, as a mean and a sigma of its inverse depth, 1/m. It keeps points that are seen
+# Sigma of the inverse depth of any point indoors, 1/m, about that of the others around. It keeps points that are seen
 # under no parallax from falling into the camera while a start is still unsure of its speed.
-USUAL_INV_DEPTH, SIGMA_INV_DEPTH = 0.3, 1.0
+SIGMA_INV_DEPTH = 0.5
 # No point is farther, and none lies beyond infinity: a scene seen the wrong way round, with the motion turned about,
 # fits the images as well while the IMU is unsure.
 LEAST_INV_DEPTH = 0.005
@@ -65,7 +65,7 @@ def visual_terms(
     x: Array, lin: Array, motion: Array, models: Ints, params: Array, mount: Array, mount_lin: Array,
     offset_s: float, base: Array, landmark: Array, start: Ints, frame: Ints, camera: Ints, px: Array,
     sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, shift_s: Array, active: Bools, robust: bool,
-    before: Array, pose_at: int, mount_at: int, offset_at: int,
+    before: Array, usual_inv_depth: float, pose_at: int, mount_at: int, offset_at: int,
     H: Array, g: Array, V_out: Array, g_landmark: Array, W: Array, chi2: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Add the observations to H (n, n) upper half and g (n,); fill V (M, 6) lower half, g_landmark (M, 3),
@@ -186,11 +186,15 @@ def visual_terms(
                 for b in range(a + 1):
                     V_out[m, slot] += j0 * J[0, 12 + b] + j1 * J[1, 12 + b] + j2 * J[2, 12 + b]
                     slot += 1
-        unusual = (landmark[m, 2] - USUAL_INV_DEPTH) / SIGMA_INV_DEPTH
+        unusual = (landmark[m, 2] - usual_inv_depth) / SIGMA_INV_DEPTH
         V_out[m, 5] += 1.0 / (SIGMA_INV_DEPTH * SIGMA_INV_DEPTH)
         g_landmark[m, 2] += unusual / SIGMA_INV_DEPTH
         cost += unusual * unusual
         comparable += unusual * unusual
+        if landmark[m, 2] <= LEAST_INV_DEPTH and g_landmark[m, 2] > 0.0:  # held at its bound
+            g_landmark[m, 2] = V_out[m, 3] = V_out[m, 4] = 0.0
+            for a in range(W.shape[2]):
+                W[m, 2, a] = 0.0
     return cost, comparable
 
 

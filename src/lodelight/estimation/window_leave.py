@@ -13,7 +13,7 @@ from lodelight.estimation.window_frames import WindowFrame, gathered, joined_imu
 from lodelight.estimation.window_problem import Belief, Problem
 from lodelight.estimation.window_tags import inverse
 from lodelight.estimation.window_types import Departed, Landmarks
-from lodelight.types import AnyArray
+from lodelight.types import AnyArray, Bools
 
 if TYPE_CHECKING:
     from lodelight.estimation.window import Window
@@ -35,7 +35,7 @@ def marginalize_oldest(window: Window) -> Departed:
     goes = first == 0
     divided = goes & (last == len(frames) - 1) & (later >= 2)
     rows = np.repeat(goes, np.diff(s.start)) & ~(np.repeat(divided, np.diff(s.start)) & late)
-    problem, _ = build(window, leaving=Leaving(rows, goes))
+    problem, _ = build(window, leaving=Leaving(rows, goes & _sure(window, s.track)))
     problem.linearize(problem.state, problem.linear)
     oldest = frames[0]
     departed = Departed(oldest.state, joined_imu(frames[1]), _finished(window, s.track[goes & ~divided]))
@@ -50,6 +50,17 @@ def marginalize_oldest(window: Window) -> Departed:
     frames[0].imu = None
     frames[0].measured, frames[0].whiten = np.zeros_like(oldest.measured), np.zeros((15, 15))
     return departed
+
+
+def _sure(window: Window, track: AnyArray) -> Bools:
+    """Which landmarks (M,) have a depth to speak of.
+
+    What is marginalized is linearized once for all, and what a sighting says of the position goes with the inverse
+    depth: where that is noise, it would say something all the same, every time in the same direction.
+    """
+    relative = window.landmark_sigma / np.maximum(window.landmark_inv_depth, 1e-9)
+    sure = window.landmark_track[relative < window.config.sure_depth]
+    return np.isin(track, sure)
 
 
 def _prior_after(window: Window, problem: Problem, oldest: WindowFrame) -> Prior:

@@ -17,8 +17,8 @@ DAMPING_START, DAMPING_MAX = 1e-8, 1e4
 # goes on from where the last one ended. What a keyframe leaves behind is linearized once for all, and taken better care
 # of.
 CONVERGED_CHI2, SETTLED_CHI2 = 0.1, 0.01
-# With first-estimate Jacobians the step ends where J^T r vanishes, a little beside the lowest cost: so much higher it
-# may come to lie, in chi-square.
+# The quadratic of the prior is followed by its own Jacobian, the identity, though the chart turns with the state: a step
+# may end so much higher, in chi-square.
 RISE_CHI2 = 0.05
 NO_COVARIANCE = 1e-6  # on every diagonal: what no factor holds stays where it is
 
@@ -102,6 +102,8 @@ class Problem:
 
     lin : where what the prior knows was linearized; the rows of all others follow the state
     frozen_frames, frozen_mounts, frozen_tags : which rows do not follow
+    usual_inv_depth : 1/m, of points here, see the kernels
+    first_estimates : Jacobians of what the prior knows are taken at lin, those of what leaves are; see the prior
     measured (F - 1, 76), whiten (F - 1, 15, 15) : IMU; use_imu (F - 1,); still_sigma (F,)
     """
 
@@ -122,6 +124,7 @@ class Problem:
     calibrate_offset: bool
     sightings: Sightings
     base: Array
+    usual_inv_depth: float
     active: Bools
     tag_sightings: TagSightings
     measured: Array
@@ -129,6 +132,7 @@ class Problem:
     use_imu: Bools
     still_sigma: Array
     prior: Prior
+    first_estimates: bool = False
     beliefs: Mapping[Key, Belief] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -209,13 +213,15 @@ class Problem:
         s, t = self.sightings, self.tag_sightings
         out.H[:] = 0.0
         out.g[:] = 0.0
-        frames, tags = self.lin_frames(x), self.lin_tags(x)
-        mounts = self.lin.mounts if self.frozen_mounts else x.mounts
+        frames, tags, mounts = x.frames, x.tags, x.mounts
+        if self.first_estimates:
+            frames, tags = self.lin_frames(x), self.lin_tags(x)
+            mounts = self.lin.mounts if self.frozen_mounts else x.mounts
         offset = float(x.offset_s[0])
         out.cost, out.comparable = kernels.visual_terms(
             x.frames, frames, self.motion, self.models, self.params, x.mounts, mounts, offset, self.base,
             x.landmarks, s.start, s.frame, s.camera, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
-            self.active, robust, out.chi2 if before is None else before, self.pose_at, self.mount_at, self.offset_at,
+            self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth, self.pose_at, self.mount_at, self.offset_at,
             out.H, out.g, out.V, out.g_landmark, out.W, out.chi2,
         )  # fmt: skip
         delta = self.offsets(x)[self.prior_at]

@@ -23,6 +23,7 @@ class WindowConfig:
     reject_px : a residual of so many sigmas is no measurement of its point
     split : of a landmark that is still seen when its first keyframe leaves, the sightings in so many of its oldest
         keyframes go into the prior, the later ones go on as a new landmark: no sighting counts twice
+    sure_depth : relative sigma of the inverse depth above which a landmark that leaves is dropped
     tag_gate_chi2 : of the eight residuals of a tag against the window without it; 99 % of a chi-square distribution
     tag_memory : estimated tags that stay in the window after their last sighting has left it
     tag_inflation : on the covariance of one that leaves, whose correlation with the window is forgotten
@@ -38,6 +39,7 @@ class WindowConfig:
     offset_sigma_s: float = 0.01
     reject_px: float = 5.0
     split: int = 5
+    sure_depth: float = 0.5
     tag_gate_chi2: float = 20.09
     tag_memory: int = 8
     tag_inflation: float = 4.0
