@@ -1,13 +1,18 @@
 """Localization in a saved map, measured: `python benchmarks/localization.py TASK ...`
 
-blocks RECORDING --length 30    map from even blocks of a recording with depth, queries from odd ones,
-                                colour alone
+blocks RECORDING --length 30    map from even blocks of a recording with depth, queries from odd ones, colour alone
+pair RUN RECORDING QUERY        a recording in the map that `lodelight run RECORDING --out RUN` made
+wrong RUN RECORDING QUERY OTHER ...   frames of QUERY, and of other buildings, of which none may be found there
+kidnap RUN RECORDING QUERY      50 times: 10 s of darkness, then another known place
+speed QUERY --keyframes 1000    global relocalization in a map of so many keyframes, of a recording with depth
+memory RUN QUERY --minutes 30   a recording over and over, its frames decoded once
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from collections import Counter
 from dataclasses import replace
@@ -22,8 +27,10 @@ import numpy as np
 from lodelight.evaluation.associate import matched
 from lodelight.geometry.se3 import SE3
 from lodelight.io.sources import open_source
+from lodelight.io.trajectories import read_trajectory
 from lodelight.localizer import Localizer, LocalizerConfig
 from lodelight.mapping.map import Map
+from lodelight.mapping.store import load_map
 from lodelight.messages import Estimate, Frame
 from lodelight.settings import with_settings
 from lodelight.slam import Slam, SlamConfig
@@ -133,6 +140,137 @@ def blocks(given: argparse.Namespace) -> None:
         print(*run.events, sep="\n")
 
 
+def pair(given: argparse.Namespace) -> None:
+    map, T_map_truth = loaded(given)
+    query = open_source(given.query)
+    run = Query(query.rig, map, query.messages("mono", end_s=given.end), given)
+    print(f"{query.name} in {given.run}, {len(map.alive_keyframes)} keyframes: {run.told()}")
+    off, turn, status = run.errors(T_map_truth, query.ground_truth())
+    print(f"  median {np.median(off):.4f} m {np.median(turn):.3f} deg, p95 {np.percentile(off, 95):.3f} m")
+    for name in ("tracking", "degraded", "relocalized"):
+        some = off[[s == name for s in status]]
+        if len(some):
+            print(f"  {name}: {len(some)}, median {np.median(some):.4f} m, largest {some.max():.3f} m")
+    jumps = [e["jump_m"] for e in run.events if "jump_m" in e]
+    print(f"  {len(jumps)} exits with a jump of {np.median(jumps) if jumps else 0.0:.3f} m in the median")
+    if given.verbose:
+        print(*((e.t_ns, e.status, e.inliers, int(e.details["temporary"]), e.why) for e in run.estimates), sep="\n")
+        print(*run.events, sep="\n")
+
+
+def wrong(given: argparse.Namespace) -> None:
+    """Every frame by itself, as a lost camera would ask: global relocalization with the second look."""
+    map, T_map_truth = loaded(given)
+    for path in [given.query, *given.others]:
+        recording = open_source(path)
+        right, truth = path == given.query, recording.ground_truth()
+        found, far, asked, start = 0, 0, 0, time.process_time()
+        for i, frame in enumerate(recording.messages("mono")):
+            if i % given.every:
+                continue
+            estimate = alone(recording.rig, map, given).feed(frame)
+            asked += 1
+            if estimate.localized:
+                found += 1
+                true = T_map_truth @ truth_at(truth, frame.t_ns) if right else SE3.identity()
+                far += bool(np.linalg.norm(estimate.T_world_body.t - true.t) > 0.5)
+        ms = 1e3 * (time.process_time() - start) / max(asked, 1)
+        verdict = f", {far} of them over 0.5 m off" if right else " (none may be)"
+        print(f"  {recording.name}: {found} of {asked} found{verdict}; CPU {ms:.0f} ms a frame", flush=True)
+
+
+PLACES: dict[int, Any] = {}
+
+
+def alone(rig, map: Map, given: argparse.Namespace) -> Localizer:
+    """A localizer that has seen nothing yet; the index of places, which is of the map alone, is made once."""
+    localizer = Localizer(rig, map, with_settings(LocalizerConfig(), given.set))
+    relocalizer = localizer.ladder.relocalizer
+    relocalizer.places = PLACES.setdefault(id(map), relocalizer.places)
+    return localizer
+
+
+def kidnap(given: argparse.Namespace) -> None:
+    map, T_map_truth = loaded(given)
+    query = open_source(given.query)
+    frames = [Frame(f.t_ns, f.images[:1]) for f in query.messages("mono")]
+    truth, rng = query.ground_truth(), np.random.default_rng(0)
+    step_ns = int(np.median(np.diff([f.t_ns for f in frames])))
+    black = np.zeros_like(frames[0].images[0])
+    took = []
+    for _ in range(given.trials):
+        before, after = rng.integers(0, len(frames) - 30, 2)
+        localizer, t_ns = alone(query.rig, map, given), 0
+        for frame in frames[before : before + 5]:
+            t_ns += step_ns
+            localizer.feed(Frame(t_ns, frame.images))
+        for _ in range(10):
+            t_ns += 10**9
+            assert not localizer.feed(Frame(t_ns, (black,))).localized
+        start_ns = t_ns
+        for frame in frames[after : after + 30]:
+            t_ns += step_ns
+            estimate = localizer.feed(Frame(t_ns, frame.images))
+            true = T_map_truth @ truth_at(truth, frame.t_ns)
+            if estimate.localized and np.linalg.norm(estimate.T_world_body.t - true.t) <= 0.05:
+                took.append((t_ns - start_ns) * 1e-9)
+                break
+    within = sum(t_s <= 1.0 for t_s in took)
+    print(
+        f"{within} of {given.trials} back within 1 s and 5 cm; took {np.median(took):.3f} s, at most {max(took):.3f} s"
+    )
+
+
+def speed(given: argparse.Namespace) -> None:
+    """A map of every other frame, each a keyframe at its true pose with the points of its own depths, and the same
+    again 100 m away until there are enough: relocalization has the most rivals there."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from lodelight.localization.relocalize import Relocalizer
+    from single_frames import ORB, map_of, shots
+
+    recording = open_source(given.query)
+    taken = shots(recording, "rgbd", 2)
+    copies = -(-given.keyframes // len(taken))
+    moved = [
+        replace(shot, T_world_cam=SE3(shot.T_world_cam.R, shot.T_world_cam.t + np.array([100.0 * k, 0.0, 0.0])))
+        for k in range(copies)
+        for shot in taken
+    ]
+    map = map_of(moved[: given.keyframes], recording.rig.cameras[0].camera)
+    relocalizer = Relocalizer(map, ORB)
+    relocalizer.find(taken[0].seen)
+    ms = []
+    for shot in taken[1::7]:
+        start = time.process_time()
+        relocalizer.find(shot.seen)
+        ms.append(1e3 * (time.process_time() - start))
+    print(
+        f"{len(map.keyframes)} keyframes, {len(ms)} queries: ms median {np.median(ms):.0f}, largest {max(ms):.0f}"
+    )
+
+
+def memory(given: argparse.Namespace) -> None:
+    """There and back again through the recording, so that the camera never jumps."""
+    map = load_map(given.run / "map.lode")
+    query = open_source(given.query)
+    frames = [Frame(f.t_ns, f.images[:1]) for f in query.messages("mono", end_s=given.end)]
+    step_ns = int(np.median(np.diff([f.t_ns for f in frames])))
+    localizer = Localizer(query.rig, map, with_settings(LocalizerConfig(), given.set))
+    there_and_back = [*frames, *frames[-2:0:-1]]
+    per_minute = round(60e9 / step_ns)
+    for i in range(given.minutes * per_minute + 1):
+        localizer.feed(Frame(i * step_ns, there_and_back[i % len(there_and_back)].images))
+        if i % per_minute == 0:
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            print(f"minute {i // per_minute}: {pages * 4096 / 1e6:.1f} MB resident", flush=True)
+
+
+def loaded(given: argparse.Namespace) -> tuple[Map, SE3]:
+    """The map of a run, and T_map_truth by its path and the truth of what it was made from."""
+    truth = open_source(given.recording).ground_truth()
+    return load_map(given.run / "map.lode"), T_map_truth_of(read_trajectory(given.run / "trajectory.tum"), truth)
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     tasks = arguments.add_subparsers(required=True)
@@ -151,6 +289,15 @@ def main() -> None:
     parser.add_argument("--length", type=int, default=30)
     parser.add_argument("--against-slam", action="store_true", help="not the truth, but SLAM over all frames")
     parser.add_argument("--truth-late-ms", type=float, default=0.0, help="clock of the truth, against the images'")
+    task("pair", pair, "run", "recording", "query").add_argument("--end", type=float, default=float("inf"))
+    parser = task("wrong", wrong, "run", "recording", "query")
+    parser.add_argument("others", type=Path, nargs="*")
+    parser.add_argument("--every", type=int, default=1)
+    task("kidnap", kidnap, "run", "recording", "query").add_argument("--trials", type=int, default=50)
+    task("speed", speed, "query").add_argument("--keyframes", type=int, default=1000)
+    parser = task("memory", memory, "run", "query")
+    parser.add_argument("--minutes", type=int, default=30)
+    parser.add_argument("--end", type=float, default=float("inf"))
     given = arguments.parse_args()
     cv2.setNumThreads(1)
     given.work(given)

@@ -16,11 +16,13 @@ from lodelight.geometry.se3 import SE3
 from lodelight.localization.temporary import TemporaryPoints
 from lodelight.localization.tracker import Landmarks, Tracked, Tracker, TrackerConfig
 from lodelight.mapping.map import Map
-from lodelight.mapping.sight import in_sight, local_keyframes, points_of_keyframes
+from lodelight.mapping.sight import in_sight, keyframes_near, local_keyframes, points_of_keyframes
 from lodelight.rig import Rig
 from lodelight.types import Ints
 
 FIRST_TEMPORARY = -2
+ENOUGH_VOTES = 30  # matches with the map, from which its own covisibility says best what is around
+NEAR_M, NEAR_DEG, NEAREST = 8.0, 60.0, 20  # else keyframes from so near, turned by so little, at most so many
 
 
 class Follower(Tracker):
@@ -68,8 +70,7 @@ class Follower(Tracker):
         map_alone : without temporary points
         """
         map = self.map
-        reference = self.last.reference if self.last else 0
-        voting = local_keyframes(map, point, otherwise=reference)
+        voting = self._around(T_world_body, point)
         sight = in_sight(map, points_of_keyframes(map, voting), T_world_body, self.T_body_cam, self.camera, self.orb)
         mapped = np.where(point >= 0, point, -1).astype(np.int32)
         mapped = self._matched(sight, map.points.desc[sight.point], mapped, mapped < 0, index, search)
@@ -100,6 +101,16 @@ class Follower(Tracker):
         if solved.n_inliers < self.config.min_inliers:
             tracked.why_lost = f"{solved.n_inliers} of {len(used)} matches with the local map are inliers"
         return tracked
+
+    def _around(self, T_world_body: SE3, point: Ints) -> Ints:
+        """Keyframes whose points make the local map: those that see what the frame sees, and where that is little,
+        those that look from near its pose where it looks."""
+        voting = local_keyframes(self.map, point, otherwise=-1) if np.any(point >= 0) else np.zeros(0, np.int32)
+        if np.count_nonzero(point >= 0) >= ENOUGH_VOTES:
+            return voting
+        near = keyframes_near(self.map, T_world_body @ self.T_body_cam, NEAR_M, NEAR_DEG)[:NEAREST]
+        around = np.concatenate([voting, near[~np.isin(near, voting)]]).astype(np.int32)
+        return around if len(around) else np.zeros(1, np.int32)
 
     def _landmarks_of_frame(self, frame: Tracked, T_world_body: SE3) -> Landmarks:
         """The last frame's points of both kinds."""

@@ -21,6 +21,7 @@ from lodelight.localization.relocalize import Hint, Relocalizer, RelocalizerConf
 from lodelight.localization.states import State, States, StatesConfig, Step
 from lodelight.localization.temporary import TemporaryConfig, TemporaryPoints
 from lodelight.localization.tracker import Tracked, TrackerConfig
+from lodelight.localization.window import adjust_window
 from lodelight.mapping.map import Map
 from lodelight.messages import Status
 from lodelight.rig import Rig
@@ -148,11 +149,15 @@ class Ladder:
             tracked = self._leave(tracked, tracked.T_world_body, "the map is enough again")
         if step is Step.enter:
             self.emit(t_ns, "carried", begins=True, why=self.states.why)
-        self.follower.accept(tracked)
+        well = tracked.n_inliers >= self.config.states.good_inliers
         if self.states.state is State.carried:
             self.temporary.grow(tracked)
+            if self.temporary.remember(tracked, well):
+                adjust_window(self.temporary, self.map, tracked, self.config.tracking.sigma_px)
             tracked = self._look_beside(tracked)
-        self.temporary.remember(tracked, well=tracked.n_inliers >= self.config.states.good_inliers)
+        else:
+            self.temporary.remember(tracked, well)
+        self.follower.accept(tracked)
         return self._told(tracked)
 
     def _told(self, tracked: Tracked) -> Tracked:
@@ -220,7 +225,6 @@ class Ladder:
         self.states.leave("")
         self._end_carrying(tracked.t_ns, why, jump_m=jump_m)
         self.follower.forget()
-        self.follower.accept(alone)
         return alone
 
     def _question(self, tracked: Tracked) -> Question:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +12,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.localization.machine import Found
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
+from lodelight.mapping.sight import keyframes_near
 from lodelight.mapping.verification import Location, Refusal, Verifier, elsewhere
 from lodelight.rig import CameraSpec
 from lodelight.types import Array, Ints
@@ -112,13 +112,9 @@ class Relocalizer:
 
     def _keyframes_near(self, hint: Hint) -> Ints:
         """Keyframes whose cameras may be within reach of a hint's, and look where it looks."""
-        k, sigmas, T_body_mapped = self.map.keyframes, self.config.hint_sigmas, self.map.rig.cameras[0].T_body_cam
-        T_world_cam = hint.T_world_body @ self.T_body_cam
-        away = k.p + k.R @ T_body_mapped.t - T_world_cam.t
-        cosine = k.R @ T_body_mapped.R[:, 2] @ T_world_cam.R[:, 2]
-        turn_deg = min(self.config.hint_angle_deg + hint.turn_deg(sigmas), 180.0)
-        near = k.alive & (np.linalg.norm(away, axis=1) <= hint.reach(away, sigmas))
-        return np.flatnonzero(near & (cosine >= math.cos(math.radians(turn_deg)) - 1e-9)).astype(np.int32)
+        sigmas, T_world_cam = self.config.hint_sigmas, hint.T_world_body @ self.T_body_cam
+        reach_m = hint.reach(self.map.keyframes.p - hint.T_world_body.t, sigmas)
+        return keyframes_near(self.map, T_world_cam, reach_m, self.config.hint_angle_deg + hint.turn_deg(sigmas))
 
     def _far(self, found: Location, hint: Hint | None) -> str:
         """Whether an answer is out of a hint's reach; empty where it is not."""

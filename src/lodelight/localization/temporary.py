@@ -51,9 +51,9 @@ class TemporaryConfig:
     past_deg: float = 6.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Past:
-    """An earlier frame. point, temporary : (N,) as in `Tracked`; well : the map alone held it"""
+    """An earlier frame; adjusting moves it. point, temporary : (N,) as in `Tracked`; well : the map alone held it"""
 
     seen: Features
     T_world_body: SE3
@@ -102,19 +102,25 @@ class TemporaryPoints:
         """The camera is somewhere else now."""
         self._past.clear()
 
-    def remember(self, tracked: Tracked, well: bool) -> None:
-        """Keep a frame as a partner for later ones, if it is not where the last one was."""
+    @property
+    def past(self) -> list[Past]:
+        """The earlier frames, oldest first."""
+        return list(self._past)
+
+    def remember(self, tracked: Tracked, well: bool) -> bool:
+        """Keep a frame as a partner for later ones, if it is not where the last one was; returns whether it is kept."""
         if self._past:
             apart = self._past[-1].T_world_body.inverse() @ tracked.T_world_body
             near = float(np.linalg.norm(apart.t)) < self.config.past_m and apart.angle < math.radians(
                 self.config.past_deg
             )
             if near and (self._past[-1].well or not well):
-                return
+                return False
         temporary = _none(tracked.seen) if tracked.temporary is None else tracked.temporary.copy()
         self._past.append(
             Past(tracked.seen, tracked.T_world_body, tracked.point.copy(), temporary, tracked.noise, well)
         )
+        return True
 
     def in_sight(self, T_world_body: SE3) -> Sight:
         """Which of them should be seen, and where."""

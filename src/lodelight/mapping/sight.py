@@ -13,7 +13,7 @@ from lodelight.features.orb import OrbConfig
 from lodelight.geometry.cameras import Camera, project_point
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
-from lodelight.types import Array, Bools, Ints
+from lodelight.types import AnyArray, Array, Bools, Ints
 
 MAX_KEYFRAMES = 80
 NEIGHBOURS_OF = 10  # so many of the best voters bring their best neighbours along
@@ -54,6 +54,17 @@ def local_keyframes(map: Map, points: Ints, otherwise: int) -> Ints:
             if other >= 0:
                 chosen.setdefault(int(other))
     return np.array(list(chosen)[:MAX_KEYFRAMES], np.int32)
+
+
+def keyframes_near(map: Map, T_world_cam: SE3, reach_m: AnyArray | float, turn_deg: float) -> Ints:
+    """Keyframes within reach of a camera (of each keyframe, where there are several), that look where it looks: the
+    nearest first."""
+    k, T_body_cam = map.keyframes, map.rig.cameras[0].T_body_cam
+    distance = np.linalg.norm(k.p + k.R @ T_body_cam.t - T_world_cam.t, axis=1)
+    cosine = k.R @ T_body_cam.R[:, 2] @ T_world_cam.R[:, 2]
+    near = k.alive & (distance <= reach_m) & (cosine >= math.cos(math.radians(min(turn_deg, 180.0))) - 1e-9)
+    found = np.flatnonzero(near).astype(np.int32)
+    return found[np.argsort(distance[found], kind="stable")]
 
 
 def points_of_keyframes(map: Map, keyframes: Ints) -> Ints:
