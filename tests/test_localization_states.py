@@ -1,0 +1,236 @@
+"""The states of localization: thresholds, hysteresis, budgets; and cameras in corridors that were redecorated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from corridors import MAPPING, ORB, OTHER, Corridor, walk
+from lodelight.geometry.se3 import SE3
+from lodelight.localization.beside import ThreadedSearch
+from lodelight.localization.follower import n_temporary
+from lodelight.localization.ladder import Ladder, LadderConfig
+from lodelight.localization.relocalize import Hint
+from lodelight.localization.states import State, States, StatesConfig, Step
+
+S = 10**9
+
+
+def followed(**config):
+    states = States(StatesConfig(**config))
+    states.found(0)
+    return states
+
+
+def judged(states, counts, start_s=10.0):
+    """Steps for (points of the map, of both kinds) at 10 Hz."""
+    return [states.judge(round((start_s + 0.1 * i) * S), *count, 0.05) for i, count in enumerate(counts)]
+
+
+def test_the_map_is_enough_at_exactly_n1_and_not_one_point_below():
+    assert judged(followed(), [(90, 90)] * 5) == [Step.keep] * 5
+    assert judged(followed(), [(89, 89)] * 2) == [Step.keep, Step.enter]
+
+
+def test_one_poor_frame_does_not_begin_carrying_and_a_good_one_starts_the_count_anew():
+    states = followed()
+    assert judged(states, [(60, 60), (95, 95), (60, 60), (95, 95)]) == [Step.keep] * 4
+    assert states.state is State.following
+
+
+def test_a_frame_below_n2_decides_nothing_and_the_second_is_lost():
+    states = followed()
+    assert judged(states, [(200, 200), (29, 29), (29, 29)]) == [Step.keep, Step.unsure, Step.lost]
+    assert states.state is State.searching
+    assert "29 points of the map agree, 30 are needed" in states.why
+
+
+def test_carried_frames_need_points_of_either_kind_and_end_when_the_map_is_enough():
+    states = followed()
+    steps = judged(states, [(60, 60), (60, 60), (0, 30), (0, 29), (0, 30), (95, 120)])
+    assert steps == [Step.keep, Step.enter, Step.keep, Step.unsure, Step.keep, Step.leave]
+    assert states.state is State.following
+
+
+def test_soon_after_being_found_more_points_are_asked_of_a_carried_frame():
+    assert judged(followed(), [(60, 60), (60, 60), (10, 49)], start_s=0.1)[-1] is Step.unsure
+    assert judged(followed(), [(60, 60), (60, 60), (10, 50)], start_s=0.1)[-1] is Step.keep
+
+
+def test_drift_is_borne_with_for_so_long_and_no_longer():
+    states = followed(max_carried_s=2.0)
+    steps = judged(states, [(60, 60)] * 2 + [(5, 80)] * 30)
+    assert steps.index(Step.lost) == 1 + 21
+    states = followed(max_carried_m=1.0)
+    assert Step.lost in judged(states, [(60, 60)] * 2 + [(5, 80)] * 30)
+    # while the map holds the pose, if only just, nothing drifts
+    assert Step.lost not in judged(followed(max_carried_s=2.0), [(60, 100)] * 50)
+
+
+def test_without_temporary_points_the_camera_is_followed_down_to_n2():
+    states = States(StatesConfig(), carrying=False)
+    states.found(0)
+    assert judged(states, [(60, 60)] * 5 + [(20, 20)] * 2) == [Step.keep] * 5 + [Step.unsure, Step.lost]
+
+
+# -- cameras in corridors ----------------------------------------------------------------------------------------
+
+
+class Walk:
+    """A walk with another camera through a corridor of which a stretch is not as it was mapped."""
+
+    def __init__(self, gap=None, carrying=True, seed=0, x_m=(2.0, 21.0), config=None, live=False, dark_s=None):
+        built = Corridor.built(seed)
+        self.map = built.mapped(seed)
+        self.before = {name: {c: v.copy() for c, v in t.columns.items()} for name, t in self.map.tables.items()}
+        now = built.redecorated(*gap, seed=seed + 1000) if gap else built
+        self.events = []
+        self.ladder = Ladder(
+            OTHER, self.map, ORB, config or LadderConfig(), 0, carrying, live,
+            lambda t_ns, kind, **fields: self.events.append((t_ns, kind, fields)),
+        )  # fmt: skip
+        rng = np.random.default_rng(seed + 5)
+        self.status, self.error_m, self.error_deg, self.carried_by, self.poses = [], [], [], [], []
+        for i, x in enumerate(np.arange(*x_m, 0.08)):
+            T_world_body = walk(x, 0.3 * np.sin(0.4 * x), 0.1 * np.sin(0.7 * x))
+            seen, _ = now.seen(OTHER, T_world_body, rng)
+            if dark_s and dark_s[0] <= 0.1 * i < dark_s[1]:
+                seen = seen.take(np.zeros(0, int))
+            tracked = self.ladder.locate(i * S // 10, seen)
+            off = T_world_body.inverse() @ tracked.T_world_body
+            self.status.append(self.ladder.status)
+            self.error_m.append(float(np.linalg.norm(off.t)))
+            self.error_deg.append(float(np.degrees(off.angle)))
+            self.carried_by.append(n_temporary(tracked))
+            self.poses.append(tracked.T_world_body)
+        self.localized = np.array([s in ("tracking", "degraded", "relocalized") for s in self.status])
+        self.error_m = np.array(self.error_m)
+
+    def told(self, kind):
+        return [fields for _, of, fields in self.events if of == kind]
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return Walk()
+
+
+@pytest.fixture(scope="module")
+def redecorated():
+    return Walk(gap=(5.0, 16.0))
+
+
+def test_another_camera_with_another_lens_is_exact_to_millimetres(plain):
+    assert plain.localized.all()
+    assert plain.status[0] == "relocalized"
+    assert np.median(plain.error_m) < 0.005
+    assert plain.error_m.max() < 0.02
+    assert max(plain.error_deg) < 0.2
+
+
+def test_temporary_points_carry_the_camera_where_the_map_is_out_of_date(redecorated):
+    assert redecorated.localized.all()
+    assert max(redecorated.carried_by) > 50
+    assert redecorated.error_m[np.array(redecorated.status) == "tracking"].max() < 0.05
+    assert redecorated.error_m.max() < 0.04 * 11.0  # a camera alone drifts along a way that no map shows
+    without = Walk(gap=(5.0, 16.0), carrying=False)
+    assert redecorated.localized.mean() - without.localized.mean() > 0.1
+    assert without.ladder.temporary.created == 0
+
+
+def test_carrying_begins_and_ends_with_its_reasons_and_a_small_jump(redecorated):
+    begun, *_, ended = redecorated.told("carried")
+    assert begun["begins"]
+    assert "fewer than 90" in begun["why"]
+    assert not ended["begins"]
+    assert ended["cleared"] > 0
+    assert ended["jump_m"] < 0.1
+    assert {"tracking", "degraded"} <= set(redecorated.status)
+
+
+def test_nothing_temporary_is_left_in_points_matches_or_map(redecorated):
+    assert redecorated.ladder.temporary.created > 0
+    assert redecorated.ladder.temporary_left == 0
+    redecorated.ladder.close()
+    assert redecorated.ladder.temporary_left == 0
+    for name, table in redecorated.map.tables.items():
+        for column, value in table.columns.items():
+            np.testing.assert_array_equal(value, redecorated.before[name][column], err_msg=f"{name}.{column}")
+
+
+def test_a_camera_lost_while_it_was_carried_leaves_nothing_temporary_behind():
+    # darkness in the middle of the stretch that is not as it was mapped, so that nothing there is found again
+    lost = Walk(gap=(5.0, 30.0), x_m=(2.0, 12.0), dark_s=(8.0, 9.0))
+    assert "lost" in lost.status
+    assert lost.status[75] == "degraded"
+    assert lost.ladder.temporary.created > 0
+    assert lost.ladder.temporary_left == 0
+
+
+def test_darkness_in_a_known_place_is_over_with_the_first_frame_that_shows_something():
+    dark = Walk(dark_s=(6.0, 9.0), x_m=(2.0, 12.0))
+    assert dark.status[59] == "tracking"
+    assert all(status == "lost" for status in dark.status[60:90])
+    assert dark.status[90] == "relocalized"
+    assert dark.error_m[90:].max() < 0.02
+
+
+def test_the_same_walk_gives_the_same_bytes():
+    a, b = (Walk(gap=(5.0, 16.0), x_m=(2.0, 8.0)) for _ in range(2))
+    assert a.status == b.status
+    assert all(p.matrix.tobytes() == q.matrix.tobytes() for p, q in zip(a.poses, b.poses, strict=True))
+
+
+def test_the_search_beside_works_on_its_own_thread_too():
+    walked = Walk(gap=(5.0, 16.0), x_m=(2.0, 18.0), live=True)
+    walked.ladder.close()
+    assert walked.localized.all()
+    assert walked.ladder.temporary_left == 0
+
+
+def test_a_camera_is_found_only_where_it_is_hinted():
+    corridor = Corridor.built(3)
+    map, rng = corridor.mapped(3), np.random.default_rng(3)
+    seen, _ = corridor.seen(OTHER, walk(10.0), rng)
+
+    def status(T_hint, covariance):
+        ladder = Ladder(OTHER, map, ORB, LadderConfig(), 0, True, False, lambda *_, **__: None)
+        ladder.hint = (0, Hint(T_hint, 1.5, covariance))
+        ladder.locate(0, seen)
+        return ladder.status, ladder.why
+
+    sure = np.diag([0.02] * 3 + [0.01] * 3) ** 2
+    assert status(walk(10.3), sure)[0] == "relocalized"
+    assert status(walk(3.0), sure)[0] == "initializing"
+    assert status(walk(3.0), np.diag([0.02] * 3 + [4.0] * 3) ** 2)[0] == "relocalized"
+    turned = walk(10.0) @ SE3.exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0]))
+    assert status(turned, sure)[0] == "initializing"
+    assert status(turned, np.diag([1.0] * 3 + [0.01] * 3) ** 2)[0] == "relocalized"
+
+
+def test_the_camera_that_made_the_map_and_another_see_a_point_at_octaves_that_differ_by_their_focal_lengths():
+    from lodelight.mapping.sight import in_sight
+
+    corridor = Corridor.built(0)
+    map = corridor.mapped(0)
+    by = {}
+    for name, rig in (("same", MAPPING), ("other", OTHER)):
+        spec = rig.cameras[0]
+        sight = in_sight(map, map.alive_points, walk(8.0), spec.T_body_cam, spec.camera, ORB)
+        by[name] = dict(zip(sight.point.tolist(), sight.octave.tolist(), strict=True))
+    both = sorted(set(by["same"]) & set(by["other"]))
+    inner = [p for p in both if 0 < by["same"][p] < 6]
+    shift = np.mean([by["other"][p] - by["same"][p] for p in inner])
+    assert shift == pytest.approx(np.log(470.5 / 380.5) / np.log(1.2), abs=0.15)  # levels are whole numbers
+
+
+def test_what_a_search_on_its_own_thread_raises_reaches_who_asked():
+    search = ThreadedSearch(lambda what: 1 // what)
+    search.ask(1)
+    search.close()
+    assert search.answer() == 1
+    assert search.answer() is None
+    search.ask(0)
+    search.close()
+    with pytest.raises(ZeroDivisionError):
+        search.answer()
