@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lodelight.estimation.bundle import BundleProblem, bundle_adjust
+from lodelight.estimation.bundle import bundle_adjust
+from lodelight.estimation.bundle_problem import BundleProblem
 from lodelight.geometry.se3 import SE3
 from lodelight.localization.temporary import Past, TemporaryPoints
 from lodelight.localization.tracker import Tracked
