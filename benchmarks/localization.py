@@ -244,9 +244,7 @@ def speed(given: argparse.Namespace) -> None:
         start = time.process_time()
         relocalizer.find(shot.seen)
         ms.append(1e3 * (time.process_time() - start))
-    print(
-        f"{len(map.keyframes)} keyframes, {len(ms)} queries: ms median {np.median(ms):.0f}, largest {max(ms):.0f}"
-    )
+    print(f"{len(map.keyframes)} keyframes, {len(ms)} queries: ms median {np.median(ms):.0f}, largest {max(ms):.0f}")
 
 
 def memory(given: argparse.Namespace) -> None:

@@ -26,6 +26,8 @@ class Found:
 
 
 Finder = Callable[[Features], "Found | str"]
+# Told a stamp and T_world_body as tracked (None where it was lost): where to look again, None where that will do.
+Elsewhere = Callable[[int, "SE3 | None"], "SE3 | None"]
 
 
 class LocalizationMachine:
@@ -42,20 +44,38 @@ class LocalizationMachine:
         self.tracker.accept(tracked)
         self.status, self.why = "tracking", "the map begins here"
 
-    def locate(self, t_ns: int, seen: Features) -> Tracked:
-        """Pose of a frame in the map; `status` and `why` say how it was had, or why not."""
+    def locate(self, t_ns: int, seen: Features, elsewhere: Elsewhere | None = None) -> Tracked:
+        """Pose of a frame in the map; `status` and `why` say how it was had, or why not.
+
+        elsewhere : an anchor of the building that doubts what was tracked, and says where to look again
+        """
         tracked = None
         if self.status in ("tracking", "degraded", "relocalized"):
             tracked = self.tracker.track(t_ns, seen)
+        if elsewhere is not None and self.status != "initializing":
+            tracked = self._second_look(t_ns, seen, tracked, elsewhere)
         if tracked is None or tracked.why_lost:
             tracked = self._relocalize(t_ns, seen, tracked)
         else:
+            found = self.status == "lost"  # by where the anchor said
             good = self.tracker.config.good_inliers
             few = tracked.n_inliers < good
             self.status = "degraded" if few else "tracking"
             self.why = f"{tracked.n_inliers} inliers, fewer than {good}" if few else ""
+            if found:
+                self.status, self.why = "relocalized", "found where an anchor of the building said"
         self.tracker.accept(tracked)
         return tracked
+
+    def _second_look(self, t_ns: int, seen: Features, first: Tracked | None, elsewhere: Elsewhere) -> Tracked | None:
+        """What is found where an anchor says, if there is enough of it and the anchor is content; else the first."""
+        near = elsewhere(t_ns, None if first is None or first.why_lost else first.T_world_body)
+        if near is None:
+            return first
+        second = self.tracker.track_at(t_ns, seen, near)
+        if second.n_inliers < self.tracker.config.good_inliers or elsewhere(t_ns, second.T_world_body) is not None:
+            return first
+        return second
 
     def _relocalize(self, t_ns: int, seen: Features, failed: Tracked | None) -> Tracked:
         found = self._find(seen)

@@ -30,6 +30,7 @@ SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it co
 INLIERS = 0.95  # of right matches, which pass their test
 CHANCE_SIGMA = 3.0  # of the binomial distribution of those that agree by chance: so many are put down to it
 UNROLLINGS, SETTLED_PX = 3, 0.5  # of a rolling shutter: at most so many, until rows are moved by less than that
+RADIAN_M = 3.0  # a turn by a radian takes as much out of view as this many metres
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
 
 
@@ -104,6 +105,20 @@ class Tracker:
             tracked.why_lost = f"{tracked.n_inliers} of {len(used)} matches with the local map are inliers"
         return tracked
 
+    def track_at(self, t_ns: int, seen: Features, T_world_body: SE3) -> Tracked:
+        """Pose of a frame of which something else says where it was taken, to within what a search window forgives.
+
+        Matched with the keyframe that looks most alike from there, and with nothing the last frames believed.
+        """
+        keyframe = self._keyframe_near(T_world_body)
+        index = FeatureIndex(seen, self.camera.width, self.camera.height)
+        landmarks = self._landmarks_of_keyframe(keyframe)
+        pairs = self._match_predicted(landmarks, T_world_body, index)
+        fit = self._fit(T_world_body, seen, landmarks, pairs, self.config.search_px)
+        if fit.right < self.config.min_matches:
+            return self._lost(t_ns, seen, T_world_body, f"{fit.solved.n_inliers} of {fit.tried} matches fit there")
+        return self.refine(t_ns, seen, fit.solved.T_world_body, fit.point, index, search=3.0)
+
     def accept(self, tracked: Tracked) -> None:
         """Make this the last frame."""
         last = self.last
@@ -170,6 +185,13 @@ class Tracker:
         T_cam_cam = self.T_body_cam.inverse() @ T_previous_last @ self.T_body_cam
         velocity = T_cam_cam.log() / (dt_ns * 1e-9)
         return np.append(self.last.twist[:3] if np.any(self.last.twist) else velocity[:3], velocity[3:])
+
+    def _keyframe_near(self, T_world_body: SE3) -> int:
+        """The one that is nearest, a radian of turn counting as much as RADIAN_M."""
+        kf, alive = self.map.keyframes, self.map.alive_keyframes
+        chord = np.linalg.norm(kf.R[alive] - T_world_body.R, axis=(1, 2)) / math.sqrt(2.0)  # 2 sin(angle / 2)
+        away = np.linalg.norm(kf.p[alive] - T_world_body.t, axis=1) + RADIAN_M * chord
+        return int(alive[np.argmin(away)])
 
     def _landmarks_of_frame(self, frame: Tracked, T_world_body: SE3) -> Landmarks:
         """What a frame saw: its map points, and features with a depth but no map point, put where that depth says."""

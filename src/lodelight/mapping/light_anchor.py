@@ -14,12 +14,12 @@ import numpy as np
 from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3
 from lodelight.lights.alignment import Pair, agreement, align
-from lodelight.lights.buffer import FixBuffer, LightPose
+from lodelight.lights.buffer import REACH_S, FixBuffer, LightPose
 from lodelight.lights.sighted import assigned, centre_px
 from lodelight.lights.watch import LightWatch
 from lodelight.mapping.anchoring import Anchoring, AnchorSighting
 from lodelight.mapping.keyframes import Candidate, Verdict
-from lodelight.mapping.light_gate import GateConfig, LightGate
+from lodelight.mapping.light_gate import GateConfig, LightGate, difference
 from lodelight.mapping.map import Map
 from lodelight.messages import LightFix, LightSighting
 from lodelight.types import Array
@@ -30,6 +30,7 @@ NODE_GAP_S = 0.25
 PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
+WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
 NOT_YET = "the map has no place in the world yet"
 
 
@@ -100,6 +101,8 @@ class LightAnchor:
         self._why_none = "no light seen yet"
         self._verdict: tuple[int, Verdict, LightPose] | None = None
         self._pending: SE3 | None = None
+        self._asked_ns: int | None = None
+        self._doubted_ns = -1
         self.placed = False  # the map has a place in the world, if only by one fix
         self.aligned = False
 
@@ -150,6 +153,35 @@ class LightAnchor:
         if any(name in self._watch.misplaced for name in here.lights):
             return None, "one of its lights is not where it was surveyed"
         return here, ""
+
+    def start(self, t_ns: int) -> tuple[SE3, str]:
+        """T_world_body to begin a map with, and why it should not begin yet; the identity where no light is in view."""
+        self._asked_ns = t_ns if self._asked_ns is None else self._asked_ns
+        here, fix = self._buffer.at(t_ns), self._buffer.before(t_ns, REACH_S)
+        T = here.T_world_body if here is not None else fix.T_world_body if fix is not None else None
+        if T is not None:
+            self.placed = True
+            self.emit(t_ns, "world", why="the map begins where the lights say", pairs=1, moved_m=0.0, turned_deg=0.0)
+            return T, ""
+        waited_s = (t_ns - self._asked_ns) * NS
+        return SE3.identity(), "waits for a first pose by the lights" if waited_s < WAIT_S else ""
+
+    def doubt(self, t_ns: int, T_world_body: SE3 | None) -> SE3 | None:
+        """Where to look for a frame that was lost, or tracked farther from the lights' pose than the gate allows."""
+        light, config = self._buffer.at(t_ns) if self.placed else None, self.gate.config
+        if light is None or t_ns < self.gate.trusted_from_ns or light.rms_px > config.max_rms_px:
+            return None
+        if any(name in self._watch.misplaced for name in light.lights):
+            return None
+        if T_world_body is None:
+            return light.T_world_body
+        d = difference(T_world_body, np.zeros((6, 6)), light, self.map.rig.cameras[0].T_body_cam)
+        if d.angle_deg <= config.max_deg and d.centre_m <= config.max_m:
+            return None
+        if t_ns != self._doubted_ns:  # not what was found there, when that is shown as well
+            self._doubted_ns = t_ns
+            self.emit(t_ns, "light_doubt", angle_deg=d.angle_deg, centre_m=d.centre_m)
+        return light.T_world_body
 
     def ask(self, candidate: Candidate) -> Verdict:
         """The gate among the keyframe conditions."""

@@ -92,7 +92,7 @@ class LightGate:
         self._refusing_since_ns: int | None = None
         self._last_ns = 0
         self._refused_by: list[tuple[str, ...]] = []
-        self.trusted_from_ns = -(10**18)
+        self.trusted_from_ns = self.lenient_until_ns = -(10**18)
         self.counts = {"pass": 0, "veto": 0, "abstain": 0}
         self.blamed = ""  # "map" or "lights", by the last question alone
 
@@ -132,6 +132,8 @@ class LightGate:
         """VETO, unless tracking hangs by a thread, or it has been said for too long: then blame somebody."""
         if c.inliers < 0.25 * c.reference_points:
             return self._abstain(f"{told}, but tracking cannot wait", weight)
+        if c.t_ns < self.lenient_until_ns:  # the map must go on, or it is lost as well as wrong
+            return self._abstain(f"{told}, the map is wrong here and was told so", LEAST_WEIGHT)
         if self._refusing_since_ns is None or (c.t_ns - self._last_ns) * 1e-9 > self.config.veto_s:
             self._refusing_since_ns, self._refused_by = c.t_ns, []
         self._refused_by.append(light.lights)
@@ -139,7 +141,7 @@ class LightGate:
             return Verdict("VETO", told, weight)
         self._refusing_since_ns = None
         if self._sure(light):
-            self.blamed = "map"
+            self.blamed, self.lenient_until_ns = "map", c.t_ns + round(self.config.distrust_s * 1e9)
             return Verdict("VETO", f"{told} for {self.config.veto_s:g} s; the lights agree among themselves", weight)
         self.distrust(c.t_ns)
         return self._abstain(f"{told} for {self.config.veto_s:g} s; the lights cannot prove themselves")
