@@ -71,11 +71,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a gate says. PASS with a weight in (0, 1]; VETO; ABSTAIN where it cannot tell: passed, unverified."""
+    """What a gate says. PASS with a weight in (0, 1]; VETO; ABSTAIN where it cannot tell: passed, unverified.
+
+    can_wait : why a frame that passed need not become a keyframe yet; empty where it may
+    """
 
     verdict: Literal["PASS", "VETO", "ABSTAIN"]
     why: str
     weight: float = 1.0
+    can_wait: str = ""
 
 
 Gate: TypeAlias = Callable[[Candidate], Verdict]
@@ -150,6 +154,8 @@ def decide(c: Candidate, config: KeyframeConfig, gates: tuple[Gate, ...] = ()) -
         said = gate(c)
         if said.verdict == "VETO":
             return Decision(False, said.why)
+        if said.can_wait:
+            return Decision(False, said.can_wait)
         weight = min(weight, said.weight)
         reasons.append(said.why)
     why = "needs close points" if needs_close_points(c, config) else f"{c.inliers} of {c.reference_points} points left"

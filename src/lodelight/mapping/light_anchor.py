@@ -31,7 +31,7 @@ PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of t
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
-NOT_YET = "the map has no place in the world yet"
+NOT_YET = "the map's place in the world rests on less than ten fixes"
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ class LightAnchor:
         self._pending: SE3 | None = None
         self._asked_ns: int | None = None
         self._doubted_ns = -1
+        self._no_fit = ""
         self.placed = False  # the map has a place in the world, if only by one fix
         self.aligned = False
 
@@ -140,8 +141,8 @@ class LightAnchor:
 
     def pose_at(self, t_ns: int) -> tuple[LightPose | None, str]:
         """The body by the lights at a frame's stamp, or why not. An older fix is carried on by the tracked motion."""
-        if not self.placed:
-            return None, NOT_YET
+        if not self.aligned:
+            return None, self._no_fit or NOT_YET
         here = self._buffer.at(t_ns)
         if here is None:
             fix, now = self._buffer.before(t_ns, self.gate.config.stale_s), self._node_at(t_ns)
@@ -168,7 +169,8 @@ class LightAnchor:
 
     def doubt(self, t_ns: int, T_world_body: SE3 | None) -> SE3 | None:
         """Where to look for a frame that was lost, or tracked farther from the lights' pose than the gate allows."""
-        light, config = self._buffer.at(t_ns) if self.placed else None, self.gate.config
+        light = self._buffer.at(t_ns) if self.aligned else None
+        config = self.gate.config
         if light is None or t_ns < self.gate.trusted_from_ns or light.rms_px > config.max_rms_px:
             return None
         if any(name in self._watch.misplaced for name in light.lights):
@@ -252,9 +254,10 @@ class LightAnchor:
             return
         found = align(pairs)
         if found.count < max(ALIGN_PAIRS, ALIGN_SHARE * len(pairs)) or (self.aligned and found.count < 2 * now):
+            if not self.aligned and len(pairs) >= 2 * ALIGN_PAIRS:
+                self._no_fit = f"only {found.count} of {len(pairs)} poses by the lights agree on a place of the map"
             return
-        again = self.aligned
-        self.aligned = True
+        again, self.aligned, self._no_fit = self.aligned, True, ""
         if again:
             self.map.anchoring = Anchoring(self.spec, self._lights)
         self._place(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs))

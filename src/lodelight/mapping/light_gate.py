@@ -20,6 +20,7 @@ from lodelight.types import Array
 MODES = ("centre", "patent", "chi2")
 SURE_LIGHTS, SURE_PX = 3, 1.0  # lights that a fix of its own contradicts, were one of them wrong; their misfit
 LEAST_WEIGHT = 0.05
+CLOSE_LOW = 60  # close points tracked, below which a frame that could make more of them cannot wait
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class GateConfig:
     max_deg, max_m : differences that still pass; chi2 : likewise, of six degrees of freedom
     stale_s : age of the last fix, carried on by tracking, beyond which the gate abstains; max_rms_px : of the lights
     veto_s : of vetoes without a pass between, before somebody is blamed; distrust_s : what the blamed lights get
+    overlap : share of the reference's points in view above which a frame that passed can wait: the lights hold the map
+        together where keyframes do not, so that fewer do; 1 = the keyframes' own overlap alone
     unverified_weight : of a keyframe that no light has checked
     anchor : a pose that passed holds its keyframe in every adjustment, with its weight
     """
@@ -43,6 +46,7 @@ class GateConfig:
     max_rms_px: float = 2.0
     veto_s: float = 1.0
     distrust_s: float = 2.0
+    overlap: float = 0.5
     unverified_weight: float = 0.5
     anchor: bool = True
 
@@ -125,8 +129,14 @@ class LightGate:
         weight = max(math.exp(-0.5 * excess) * share, LEAST_WEIGHT)
         if agrees:
             self._refusing_since_ns = None
-            return Verdict("PASS", told, weight)
+            return Verdict("PASS", told, weight, self._can_wait(c))
         return self._refuse(c, light, told, weight)
+
+    def _can_wait(self, c: Candidate) -> str:
+        starved = c.close_tracked < CLOSE_LOW and c.close_untracked > c.close_tracked
+        if self.config.anchor and c.inliers >= self.config.overlap * c.reference_points and not starved:
+            return f"lights agree, and {c.inliers} of the reference's {c.reference_points} points are still in view"
+        return ""
 
     def _refuse(self, c: Candidate, light: LightPose, told: str, weight: float) -> Verdict:
         """VETO, unless tracking hangs by a thread, or it has been said for too long: then blame somebody."""
