@@ -13,7 +13,8 @@ from lodelight.types import Array
 
 OFF_M = 0.3  # a light farther than this from its survey hangs elsewhere
 NEAR_M = 0.15  # one nearer than this is where it should be
-WITNESSES = 2  # other lights that must be in their places: else it is the map that is not
+WITNESSES, RECENT_S = 2, 3.0  # other lights, seen lately, that must be in their places: else it is the map that is not
+COMPANY = 0.5  # of a light's error: another one that is off by the same, to within that share of it, blames the map
 RAYS, KEPT = 6, 40  # rays that a place is found from, and that are remembered
 PARALLAX = 0.01  # least eigenvalue of the mean of I - d d^T: rays that open by about 12 degrees
 SPREAD_M = 0.15  # rms distance of the place from its rays
@@ -44,22 +45,25 @@ class LightWatch:
     def __init__(self, lights: dict[str, Light]) -> None:
         self._lights = lights
         self._rays: dict[str, deque[tuple[Array, Array]]] = {}
+        self._seen_ns: dict[str, int] = {}
         self.misplaced: dict[str, Misplaced] = {}
 
     def forget(self) -> None:
         """The poses so far were in another frame."""
         self._rays.clear()
+        self._seen_ns.clear()
         self.misplaced.clear()
 
-    def see(self, name: str, T_world_cam: SE3, ray_cam: Array) -> Misplaced | None:
+    def see(self, t_ns: int, name: str, T_world_cam: SE3, ray_cam: Array) -> Misplaced | None:
         """One sighting; the light, once, when it proves to hang elsewhere."""
         rays = self._rays.setdefault(name, deque(maxlen=KEPT))
         direction = T_world_cam.R @ ray_cam
         rays.append((T_world_cam.t, direction / np.linalg.norm(direction)))
+        self._seen_ns[name] = t_ns
         if name in self.misplaced:
             return None
         xyz = self._place(name)
-        if xyz is None or np.linalg.norm(xyz - self._lights[name].xyz) < OFF_M or self._witnesses(name) < WITNESSES:
+        if xyz is None or np.linalg.norm(xyz - self._lights[name].xyz) < OFF_M or not self._convicted(name, xyz):
             return None
         others = [o for o in self._lights.values() if o.id != name and np.linalg.norm(o.xyz - xyz) < OFF_M]
         found = Misplaced(self._lights[name], xyz, others[0].id if others else "")
@@ -80,6 +84,17 @@ class LightWatch:
         off = np.einsum("nij,nj->ni", across, xyz - centres)
         return xyz if np.sqrt((off**2).sum(axis=1).mean()) < SPREAD_M else None
 
-    def _witnesses(self, name: str) -> int:
-        places = [(self._lights[o], self._place(o)) for o in self._rays if o != name and o not in self.misplaced]
-        return sum(xyz is not None and bool(np.linalg.norm(xyz - o.xyz) < NEAR_M) for o, xyz in places)
+    def _convicted(self, name: str, xyz: Array) -> bool:
+        """Whether the light is to blame, and not the map around it, which would move its neighbours as well."""
+        off = xyz - self._lights[name].xyz
+        witnesses = 0
+        for other in self._rays:
+            lately = (self._seen_ns[name] - self._seen_ns[other]) * 1e-9 < RECENT_S
+            place = self._place(other) if other != name and lately else None
+            if place is None:
+                continue
+            other_off = place - self._lights[other].xyz
+            if np.linalg.norm(other_off - off) < COMPANY * np.linalg.norm(off):
+                return False
+            witnesses += bool(np.linalg.norm(other_off) < NEAR_M)
+        return witnesses >= WITNESSES

@@ -281,7 +281,7 @@ class LightAnchor:
             return
         px = centre_px(sighting.centre_px, T_world_cam, self.spec.camera, light)
         ray, _ = self.spec.camera.unproject(px[None])
-        misplaced = self._watch.see(light.id, T_world_cam, ray[0])
+        misplaced = self._watch.see(sighting.t_ns, light.id, T_world_cam, ray[0])
         if misplaced is not None:
             self.emit(sighting.t_ns, "light_misplaced", light=light.id, off_m=misplaced.off_m, why=misplaced.why)
             self.map.anchoring.forget_light(light.id)
