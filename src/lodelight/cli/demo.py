@@ -10,6 +10,7 @@ app = typer.Typer(add_completion=False)
 
 DURATION_S = 12.0
 SIZE, RATE_HZ = (376, 240), 15.0  # half of a EuRoC camera's: what a laptop renders in seconds
+LATER_S, LATER_SIZE = 8.0, (400, 300)
 
 
 @app.command(epilog="Example: lodelight demo --out demo")
@@ -39,3 +40,29 @@ def demo(
             f"{100 * metrics['tracked_fraction']:.0f} % of {metrics['frames']} frames, "
             f"{metrics['ms_per_frame']['p50']:.0f} ms each: {out / sensors / 'report.html'}"
         )
+    _localize(out, seed)
+
+
+def _localize(out: Path, seed: int) -> None:
+    """One other camera, with another lens and in the hand, in the map that stereo made."""
+    from lodelight.cli.localize import localize_to_folder
+    from lodelight.cli.progress import track
+    from lodelight.io.sources import open_source
+    from lodelight.localizer import LocalizerConfig
+    from lodelight.mapping.store import load_map
+    from lodelight.sim.scenarios import simulate
+
+    source, map_file = out / "later", out / "stereo" / "map.lode"
+    simulate(
+        "office", source, seed=seed, duration_s=LATER_S, motion="hand", cameras=1, lens="equidistant", depth=False,
+        size=LATER_SIZE, rate_hz=RATE_HZ, lights=False,
+        progress=lambda frames, total: track(frames, "rendering", total),
+    )  # fmt: skip
+    config = LocalizerConfig(sensors="mono", seed=seed)
+    metrics = localize_to_folder(open_source(source), out / "localize", config, load_map(map_file), map_file)
+    error = metrics["ate"]["final"]
+    print(
+        f"localize  {100 * error['rmse_m']:.1f} cm, {error['rotation_deg']:.2f} deg (ATE RMSE); one camera with another "
+        f"lens in the stereo map, {100 * metrics['tracked_fraction']:.0f} % of {metrics['frames']} frames: "
+        f"{out / 'localize' / 'report.html'}"
+    )
