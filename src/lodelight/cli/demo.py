@@ -62,7 +62,7 @@ def _localize(out: Path, seed: int) -> None:
     metrics = localize_to_folder(open_source(source), out / "localize", config, load_map(map_file), map_file)
     error = metrics["ate"]["final"]
     print(
-        f"localize  {100 * error['rmse_m']:.1f} cm, {error['rotation_deg']:.2f} deg (ATE RMSE); one camera with another "
-        f"lens in the stereo map, {100 * metrics['tracked_fraction']:.0f} % of {metrics['frames']} frames: "
+        f"localize  {100 * error['rmse_m']:.1f} cm, {error['rotation_deg']:.2f} deg (ATE RMSE); one camera with "
+        f"another lens in the stereo map, {100 * metrics['tracked_fraction']:.0f} % of {metrics['frames']} frames: "
         f"{out / 'localize' / 'report.html'}"
     )

@@ -51,10 +51,6 @@ class Follower(Tracker):
         if self.last is not None:
             self.last.temporary = None
 
-    def predicted(self, t_ns: int) -> SE3 | None:
-        """T_world_body to expect, by constant velocity; None where nothing is known."""
-        return None if self.last is None else self._predict(self.last.T_world_body, t_ns)
-
     def refine(
         self,
         t_ns: int,
