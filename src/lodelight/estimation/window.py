@@ -84,9 +84,17 @@ class Window:
     # -- what comes in
 
     def start(
-        self, state: NavState, sigma: StartSigma, observations: Observations, tags: Sequence[TagView] = ()
+        self,
+        state: NavState,
+        sigma: StartSigma,
+        observations: Observations,
+        tags: Sequence[TagView] = (),
+        standstill: bool = False,
     ) -> None:
-        """The first frame, a keyframe, with what is known of its state. The window must be new."""
+        """The first frame, a keyframe, with what is known of its state. The window must be new.
+
+        standstill : its velocity is zero
+        """
         if self.frames:
             raise RuntimeError("the window has started already; make a new one")
         R = state.T_world_body.R
@@ -95,6 +103,7 @@ class Window:
         rest = [sigma.position_m, sigma.velocity_m_s, sigma.bias_gyro, sigma.bias_accel]
         information[3:, 3:] = np.diag(np.repeat(rest, 3) ** -2.0)
         frame = self._frame(state, True, observations, tags)
+        frame.still_sigma = self.config.still_sigma_m_s if standstill else 0.0
         self.beliefs["frame", frame.key] = Belief(frame.x.copy(), information)
 
     def add_frame(

@@ -106,6 +106,7 @@ def build(window: Window, without: Collection[SeenTag] = (), leaving: Leaving | 
         whiten=np.array([f.whiten for f in frames[1:]]).reshape(F - 1, 15, 15),
         use_imu=use_imu,
         still_sigma=still,
+        still_sigma_m=window.config.still_sigma_m,
         prior=window.prior,
         first_estimates=leaving is not None,
         beliefs=_beliefs(window, numbers, leaving is not None),
@@ -144,7 +145,7 @@ def _placed(window: Window, s: Sightings, x: Array, motion: Array, models: Ints)
     at = np.minimum(at, max(len(window.landmark_track) - 1, 0))
     known = window.landmark_track[at] == s.track if len(window.landmark_track) else np.zeros(M, bool)
     world = window.landmark_world[at] if len(window.landmark_track) else np.zeros((M, 4))
-    sure = window.landmark_sigma < 0.5 * window.landmark_inv_depth
+    sure = window.landmark_sigma < 0.25 * window.landmark_inv_depth
     usual = float(np.median(window.landmark_inv_depth[sure])) if sure.sum() >= MANY else DEFAULT_INV_DEPTH
     base, landmark, parallax = np.empty((M, 3, 3)), np.empty((M, 3)), np.empty(M)
     kernels.place_landmarks(

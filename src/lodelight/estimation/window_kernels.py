@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from lodelight.compiled import kernel
-from lodelight.estimation.factors.inertial import V, inertial_jacobian, inertial_residual
+from lodelight.estimation.factors.inertial import P, V, inertial_jacobian, inertial_residual
 from lodelight.estimation.factors.inverse_depth import inverse_depth_jacobian, inverse_depth_residual
 from lodelight.estimation.factors.reprojection import CHI2_PX, CHI2_PX_DEPTH
 from lodelight.estimation.factors.tag_corners import CHI2_TAG, tag_corner_jacobian, tag_corner_residual
@@ -201,13 +201,14 @@ def visual_terms(
 @kernel
 def state_terms(
     x: Array, lin: Array, measured: Array, whiten: Array, use: Bools, still_sigma: Array,
+    still_sigma_m: float,
     prior_at: Ints, prior_H: Array, prior_g: Array, delta: Array,
     pose_at: int, H: Array, g: Array,
 ) -> float:  # fmt: skip
     """Add the IMU between frames, standstill and the prior; returns their cost.
 
     measured (F - 1, 76), whiten (F - 1, 15, 15) : L^-1 of the covariance's factor; use (F - 1,)
-    still_sigma (F,) m/s : of a velocity of zero, 0 = moving
+    still_sigma (F,) m/s : of a velocity of zero, 0 = moving; still_sigma_m : of the way between two such frames
     prior_H (q, q), prior_g (q,) : about lin, unknowns prior_at (q,); delta (q,) : how far x is from lin there
     """
     F = x.shape[0]
@@ -251,6 +252,17 @@ def state_terms(
                 H[9 * f + a, 9 * f + a] += information
                 g[9 * f + a] += information * x[f, V + a]
                 cost += information * x[f, V + a] * x[f, V + a]
+            if f > 0 and still_sigma[f - 1] > 0.0:  # and it is where it was
+                information = 1.0 / (still_sigma_m * still_sigma_m)
+                for a in range(3):
+                    now, then = pose_at + 6 * f + 3 + a, pose_at + 6 * (f - 1) + 3 + a
+                    pull = information * (x[f, P + a] - x[f - 1, P + a])
+                    H[then, then] += information
+                    H[now, now] += information
+                    H[then, now] -= information
+                    g[now] += pull
+                    g[then] -= pull
+                    cost += pull * pull / information
     q = len(prior_at)
     for i in range(q):
         pull = 0.0

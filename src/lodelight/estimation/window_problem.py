@@ -17,7 +17,7 @@ DAMPING_START, DAMPING_MAX = 1e-8, 1e4
 # goes on from where the last one ended. What a keyframe leaves behind is linearized once for all, and taken better care
 # of.
 CONVERGED_CHI2, SETTLED_CHI2 = 0.1, 0.01
-# The quadratic of the prior is followed by its own Jacobian, the identity, though the chart turns with the state: a step
+# The quadratic of the prior is followed by the identity for its Jacobian, though the chart turns with the state: a step
 # may end so much higher, in chi-square.
 RISE_CHI2 = 0.05
 NO_COVARIANCE = 1e-6  # on every diagonal: what no factor holds stays where it is
@@ -131,6 +131,7 @@ class Problem:
     whiten: Array
     use_imu: Bools
     still_sigma: Array
+    still_sigma_m: float
     prior: Prior
     first_estimates: bool = False
     beliefs: Mapping[Key, Belief] = field(default_factory=dict)
@@ -221,12 +222,13 @@ class Problem:
         out.cost, out.comparable = kernels.visual_terms(
             x.frames, frames, self.motion, self.models, self.params, x.mounts, mounts, offset, self.base,
             x.landmarks, s.start, s.frame, s.camera, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
-            self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth, self.pose_at, self.mount_at, self.offset_at,
+            self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth,
+            self.pose_at, self.mount_at, self.offset_at,
             out.H, out.g, out.V, out.g_landmark, out.W, out.chi2,
         )  # fmt: skip
         delta = self.offsets(x)[self.prior_at]
         rest = kernels.state_terms(
-            x.frames, frames, self.measured, self.whiten, self.use_imu, self.still_sigma,
+            x.frames, frames, self.measured, self.whiten, self.use_imu, self.still_sigma, self.still_sigma_m,
             self.prior_at, self.prior.H, self.prior.g, delta, self.pose_at, out.H, out.g,
         )  # fmt: skip
         if len(t.frame):

@@ -28,7 +28,8 @@ class WindowConfig:
     tag_memory : estimated tags that stay in the window after their last sighting has left it
     tag_inflation : on the covariance of one that leaves, whose correlation with the window is forgotten
     imu_noise_scale : on the rig's noise densities, which are those of a sensor at rest
-    still_sigma_m_s : of the velocity at standstill
+    still_sigma_m_s, still_sigma_m : of the velocity at standstill, and of the way between frames of one.
+        With more than a millimetre of freedom two views of a still camera fit their own pixel noise by a motion
     """
 
     keyframes: int = 10
@@ -45,6 +46,7 @@ class WindowConfig:
     tag_inflation: float = 4.0
     imu_noise_scale: float = 1.0
     still_sigma_m_s: float = 0.01
+    still_sigma_m: float = 0.001
 
     def __post_init__(self) -> None:
         if self.calibrate not in ("none", "extrinsics", "time", "both"):
