@@ -50,8 +50,10 @@ def facing(xyz, turn=(0.0, 0.0, 0.0)) -> SE3:
     return SE3.exp(np.array([*turn, *xyz], dtype=np.float64))
 
 
-def picture(camera: Camera, prints: list[Print], blur_px: float = 0.6, noise: float = 2.0, seed: int = 0) -> np.ndarray:
-    """(H, W) uint8: prints on a grey wall; none hides another."""
+def picture(
+    camera: Camera, prints: list[Print], blur_px: float = 0.6, noise: float = 2.0, seed: int = 0, fine: int = FINE
+) -> np.ndarray:
+    """(H, W) uint8: prints on a grey wall; none hides another. fine : rays of a pixel along each axis"""
     image = np.full((camera.height, camera.width), 120.0)
     for p in prints:
         n, q = len(p.modules), p.quiet
@@ -59,8 +61,8 @@ def picture(camera: Camera, prints: list[Print], blur_px: float = 0.6, noise: fl
         outline = np.array([camera.project((p.T_cam_tag @ c)[None])[0][0] for c in reach])
         x0, y0 = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 6, 0)
         x1, y1 = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 6, (camera.width, camera.height))
-        u = (np.arange(x0 * FINE, x1 * FINE) + 0.5) / FINE - 0.5
-        v = (np.arange(y0 * FINE, y1 * FINE) + 0.5) / FINE - 0.5
+        u = (np.arange(x0 * fine, x1 * fine) + 0.5) / fine - 0.5
+        v = (np.arange(y0 * fine, y1 * fine) + 0.5) / fine - 0.5
         U, V = np.meshgrid(u, v)
         rays, _ = camera.unproject(np.stack([U.ravel(), V.ravel()], axis=1))
         R, t = p.T_cam_tag.R, p.T_cam_tag.t
@@ -72,8 +74,8 @@ def picture(camera: Camera, prints: list[Print], blur_px: float = 0.6, noise: fl
         value[paper] = 215.0
         code = paper & (column >= 0) & (row >= 0) & (column < n) & (row < n)
         value[code] = np.where(p.modules[row[code], column[code]] > 0, 215.0, 25.0)
-        part = cv2.GaussianBlur(value.reshape(U.shape), (0, 0), max(blur_px, 0.01) * FINE)
-        part = part.reshape(y1 - y0, FINE, x1 - x0, FINE).mean(axis=(1, 3))
+        part = cv2.GaussianBlur(value.reshape(U.shape), (0, 0), max(blur_px, 0.01) * fine)
+        part = part.reshape(y1 - y0, fine, x1 - x0, fine).mean(axis=(1, 3))
         inside = cv2.erode(np.pad(np.ones((y1 - y0 - 2, x1 - x0 - 2), np.uint8), 1), np.ones((3, 3), np.uint8)) > 0
         image[y0:y1, x0:x1][inside] = part[inside]
     image = image + noise * np.random.default_rng(seed).standard_normal(image.shape)

@@ -17,7 +17,7 @@ LAYERS = [
     ["report"],
     ["sim", "evaluation"],
     ["io"],
-    ["rig", "anchors", "trajectory", "settings"],
+    ["rig", "anchors", "trajectory", "settings", "tagboard"],
     ["messages"],
     ["geometry"],
     ["fiducials"],

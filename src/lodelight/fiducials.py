@@ -50,3 +50,20 @@ def fiducial_modules(family: str, number: int) -> Bytes:
     modules = np.ascontiguousarray(np.rot90(image, 2) if family in APRILTAG else image).astype(np.uint8)
     modules.flags.writeable = False
     return modules
+
+
+def qr_modules(text: str) -> Bytes:
+    """(n, n) uint8 of a QR code without its quiet zone: 0 black, 1 white; a quarter of it may be lost or covered.
+
+    Raises ConfigError on a text that no code can hold.
+    """
+    import cv2
+
+    params = cv2.QRCodeEncoder_Params()  # type: ignore[attr-defined, unused-ignore]
+    params.correction_level = cv2.QRCodeEncoder_CORRECT_LEVEL_M
+    try:
+        image = cv2.QRCodeEncoder_create(params).encode(text) > 127  # type: ignore[attr-defined, unused-ignore]
+    except cv2.error:
+        raise ConfigError(f"a QR code cannot hold these {len(text)} characters; use fewer") from None
+    dark = np.flatnonzero(~image.all(axis=1))  # the encoder frames the code as it likes
+    return np.asarray(image[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1], np.uint8)

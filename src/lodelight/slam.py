@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,8 +28,9 @@ from lodelight.mapping.local import LocalMapper, LocalMappingConfig, adjust
 from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.places import Places
+from lodelight.mapping.tags import MapTags, MapTagsConfig
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
-from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message, TagSighting
 from lodelight.rig import Rig
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
@@ -57,6 +58,7 @@ class SlamConfig:
     loops: LoopConfig = field(default_factory=LoopConfig)
     gate: GateConfig = field(default_factory=GateConfig)
     lights: LightsConfig = field(default_factory=LightsConfig)
+    tags: MapTagsConfig = field(default_factory=MapTagsConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,8 @@ class Slam:
         self.machine = LocalizationMachine(self.tracker, Relocalizer(self.map, self.config.orb, places).find)
         self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
         self.loops = LoopCloser(self.map, self.config.orb, places, self.config.loops, self.emit)
+        known = anchors.tags if anchors is not None else ()
+        self.tags = MapTags(self.map, self.config.orb, self.config.mapping.sigma_px, known, self.config.tags, self.emit)
         self.live = live
         self.localization_only = False
         self.mapping = (ThreadedMapping if live else InlineMapping)(self._map)
@@ -132,9 +136,11 @@ class Slam:
     def close(self) -> None:
         """Wait until the last keyframe is mapped, then adjust the whole map once more."""
         self.mapping.close()
+        self.tags.prepare()
         if self.config.final_iterations and len(self.map.keyframes):
             orb, sigma_px = self.config.orb, self.config.mapping.sigma_px
             adjust(self.map, self.map.alive_keyframes, orb, sigma_px, self.config.final_iterations, None)
+        self.tags.finish()
 
     def feed(self, message: Message) -> Estimate | None:
         """One message; an estimate for every frame."""
@@ -146,8 +152,9 @@ class Slam:
         """One frame: see it, locate it, decide whether it becomes a keyframe, map."""
         clock = Stopwatch()
         seen = self.front_end.process(frame)
+        tags = self.tags.see(frame)
         if len(self.map.keyframes) == 0:
-            return self._begin(frame.t_ns, seen, clock)
+            return self._begin(frame.t_ns, seen, clock, tags)
         with self.map.lock:
             self._move_map()
             tracked = self.machine.locate(frame.t_ns, seen, self.lights.doubt if self.lights else None)
@@ -164,14 +171,18 @@ class Slam:
                 decision = decide(candidate, self.config.keyframes, self.gates)
             self.emit(frame.t_ns, "keyframe", inserted=decision.insert, why=decision.why, weight=decision.weight)
             if decision.insert:
-                self._insert(tracked, decision)
+                self._insert(tracked, decision, tags)
+            elif tags:
+                with self.map.lock:
+                    covariance = self._covariance(tracked)
+                    self.tags.note(tags, tracked.reference, tracked.T_reference_body, covariance, own=False)
         return estimate
 
     def trajectory(self) -> Trajectory:
         """T_world_body of all localized frames, as the map stands now."""
         return Trajectory.from_poses(
             [node.t_ns for node in self.path],
-            [self.map.pose(node.reference) @ node.T_reference_body for node in self.path],
+            [self.tags.world(self.map.pose(node.reference) @ node.T_reference_body) for node in self.path],
         )
 
     def cloud(self) -> Array:
@@ -184,6 +195,8 @@ class Slam:
             "keyframes": len(self.map.alive_keyframes),
             "map_points": len(self.map.alive_points),
             "loops": len(self.map.loops),
+            "tags": int(np.count_nonzero(self.map.tags.placed)),
+            "aligned": self.tags.aligned,
             "relocalizations": self.relocalizations,
             "dropped": self.dropped,
             **({"gate": self.lights.gate.counts} if self.lights else {}),
@@ -200,9 +213,10 @@ class Slam:
         move = self.lights.take_move() if self.lights and self.mapping.idle else None
         if move is not None:
             self.map.move(move)
+            self.tags.moved()
             self.loops.forget()
 
-    def _begin(self, t_ns: int, seen: Features, clock: Stopwatch) -> Estimate:
+    def _begin(self, t_ns: int, seen: Features, clock: Stopwatch, tags: Sequence[TagSighting]) -> Estimate:
         """The first keyframe of a new map, at the origin, if enough of what it sees has a depth."""
         close = int(np.count_nonzero(self.mapper.close(seen)))
         if close < self.config.min_start_points:
@@ -214,14 +228,14 @@ class Slam:
         nothing = np.full(len(seen), -1, np.int32)
         first = Tracked(t_ns, seen, T_world_body, np.zeros((6, 6)), nothing, reference=0)
         self.emit(t_ns, "keyframe", inserted=True, why="the first", weight=1.0)
-        self._insert(first, Decision(True, "the first"))
+        self._insert(first, Decision(True, "the first"), tags)
         self.machine.start(first)
         self.path.append(PathNode(t_ns, 0, SE3.identity()))
         if self.lights:
             self.lights.tracked(t_ns, 0, SE3.identity())
         return self._estimate(first, clock)
 
-    def _insert(self, tracked: Tracked, decision: Decision) -> None:
+    def _insert(self, tracked: Tracked, decision: Decision, tags: Sequence[TagSighting] = ()) -> None:
         """The quick half of mapping, which the next frame needs; the rest is the worker's."""
         with self.map.lock:
             parent = tracked.reference if len(self.map.keyframes) else -1
@@ -231,6 +245,7 @@ class Slam:
             tracked.point[:] = self.map.points_of(keyframe)
             if self.lights:
                 self.lights.inserted(keyframe, tracked.t_ns)
+            self.tags.note(tags, keyframe, SE3.identity(), self._covariance(tracked), own=True)
         self._last_keyframe_ns = tracked.t_ns
         self._peak_inliers = 0
         self.mapping.submit(keyframe)
@@ -240,6 +255,7 @@ class Slam:
         self.mapper.process(keyframe, self.mapping.interrupted)
         if self.map.keyframes.alive[keyframe]:
             self.loops.process(keyframe, self.mapping.interrupted)
+            self.tags.process(keyframe, self.mapping.interrupted)
         self.mapping_ms.append(clock.ms())
 
     def _candidate(self, tracked: Tracked) -> Candidate:
@@ -275,10 +291,10 @@ class Slam:
         return tracked.covariance + carried_covariance(self.map.pose(reference), known, tracked.T_world_body)
 
     def _estimate(self, tracked: Tracked, clock: Stopwatch) -> Estimate:
-        covariance = LOST_COVARIANCE if tracked.why_lost else self._covariance(tracked)
+        covariance = LOST_COVARIANCE if tracked.why_lost else self.tags.world_covariance(self._covariance(tracked))
         return Estimate(
-            tracked.t_ns, self.machine.status, tracked.T_world_body, covariance, self.machine.why,
-            tracked.n_inliers, {"track_ms": clock.ms()},
+            tracked.t_ns, self.machine.status, self.tags.world(tracked.T_world_body), covariance, self.machine.why,
+            tracked.n_inliers, {"track_ms": clock.ms(), "aligned": float(self.tags.aligned)},
         )  # fmt: skip
 
 

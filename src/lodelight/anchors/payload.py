@@ -24,7 +24,9 @@ QUAT_SLACK = 0.01  # in length; four decimals leave 1e-4
 
 
 def tag_payload(tag: Tag) -> str:
-    """What a QR code carries so that it needs no survey file."""
+    """What a QR code carries so that it needs no survey file. Raises SourceError on an id it cannot carry."""
+    if not ID.fullmatch(tag.id):
+        raise SourceError(f"tag {shown(tag.id)}: an id in a QR code must be 1 to 64 characters without blanks, ; and =")
     size = f"{tag.size_m:.4f}".rstrip("0")
     text = f"{HEAD};id={tag.id};size={size}{'0' * (2 - len(size.partition('.')[2]))}"
     if tag.T_world_tag is None:

@@ -30,6 +30,8 @@ COMMANDS = {
         "lodelight.cli.lights",
         "Visible light positioning: decode coded lights, plan their frequencies, calibrate the camera.",
     ),
+    "tags": ("lodelight.cli.tags", "Printed tags: map where they hang, print them at true size."),
+    "calibrate": ("lodelight.cli.calibrate", "Find a camera's lens from images of a printed tag board."),
     "map": ("lodelight.cli.map", "Inspect, check and export saved maps."),
     "bench": ("lodelight.cli.bench", "Time and error over recordings on this machine: medians and ranges."),
 }

@@ -133,6 +133,7 @@ def slam_to_folder(
             slam.trajectory(), slam.cloud(), {**slam.stats(), "skipped": len(recording.skipped)},
             recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
             recording_s=(last_ns - (first_ns or last_ns)) * 1e-9,
+            align="none" if slam.tags.aligned else "se3", tags=slam.tags.found(),
         )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,22 @@ from lodelight.types import AnyArray
 PLY_TYPES = {"f4": "float", "i4": "int", "u4": "uint", "u2": "ushort", "u1": "uchar"}
 
 
-def write_ply(path: str | Path, xyz: AnyArray, normal: AnyArray | None = None, **attributes: AnyArray) -> None:
-    """Points (N, 3) m, their unit normals (N, 3), and further properties (N,) by name, of float or integer type."""
+def write_ply(
+    path: str | Path,
+    xyz: AnyArray,
+    normal: AnyArray | None = None,
+    comments: Iterable[str] = (),
+    **attributes: AnyArray,
+) -> None:
+    """Points (N, 3) m, their unit normals (N, 3), and further properties (N,) by name, of float or integer type.
+
+    comments : lines of the header, in which what is not plain ASCII becomes a question mark
+    """
     rows = _rows(xyz, normal, ("nx", "ny", "nz"), attributes)
     properties = "".join(f"property {PLY_TYPES[rows.dtype[name].str[1:]]} {name}\n" for name in rows.dtype.names or ())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    write_bytes(Path(path), header.encode("ascii") + rows.tobytes())
+    said = "".join(f"comment {' '.join(text.split())}\n" for text in comments)
+    header = f"ply\nformat binary_little_endian 1.0\n{said}element vertex {len(rows)}\n{properties}end_header\n"
+    write_bytes(Path(path), header.encode("ascii", "replace") + rows.tobytes())
 
 
 def write_pcd(path: str | Path, xyz: AnyArray, normal: AnyArray | None = None, **attributes: AnyArray) -> None:

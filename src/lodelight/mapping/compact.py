@@ -15,6 +15,7 @@ REFERENCES = {
     "features": {"keyframe": "keyframes", "point": "points", "next": "features"},
     "points": {"head": "features", "first_keyframe": "keyframes", "replaced_by": "points"},
     "loops": {"a": "keyframes", "b": "keyframes"},
+    "tag_views": {"keyframe": "keyframes", "tag": "tags"},
 }
 
 
@@ -60,6 +61,7 @@ def _survivors(map: Map, heir: Ints) -> dict[str, Bools]:
         "features": np.repeat(keyframes, map.keyframes.n_features),
         "points": map.points.alive,
         "loops": (a >= 0) & (b >= 0) & (a != b),
+        "tag_views": keyframes[map.tag_views.keyframe],
     }
 
 

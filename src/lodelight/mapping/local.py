@@ -25,6 +25,7 @@ from lodelight.geometry.triangulate import triangulate_pairs
 from lodelight.mapping import kernels
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import in_sight, points_of_keyframes
+from lodelight.mapping.tag_corners import with_tag_corners
 from lodelight.types import AnyArray, Array, Bools, Ints
 
 
@@ -239,14 +240,15 @@ def adjust(
     """
     with map.lock:
         problem, keyframes, points, rows = bundle_of(map, window, orb, sigma_px)
+        tied = with_tag_corners(map, problem, keyframes, window)
     wanted = [] if newest is None else [int(np.searchsorted(keyframes, newest))]
-    result = bundle_adjust(problem, iterations=iterations, stop=stop, covariance_of=wanted)
+    result = bundle_adjust(tied, iterations=iterations, stop=stop, covariance_of=wanted)
     with map.lock:
-        commit_bundle(map, result.R, result.p, result.xyz, problem.fixed, keyframes, points)
+        commit_bundle(map, result.R, result.p, result.xyz[: len(points)], tied.fixed, keyframes, points)
         if newest is not None:
-            _set_covariance(map, newest, result.covariance[0], problem, keyframes)
+            _set_covariance(map, newest, result.covariance[0], tied, keyframes)
         still = map.features.point[rows] == points[problem.point]
-        map.unlink(rows[~result.inliers & still])
+        map.unlink(rows[~result.inliers[: len(rows)] & still])
         map.refresh_points(points[map.points.alive[points]], orb.scale_factor, orb.n_levels)
 
 

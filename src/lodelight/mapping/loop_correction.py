@@ -58,7 +58,7 @@ def correct_loop(
     if drifted:
         adjust(map, everything, orb, verifier.sigma_px, iterations, stop)
         with map.lock:
-            _take_along(map, *before)
+            take_along(map, *before)
     return Correction(moved_m, fused)
 
 
@@ -69,7 +69,7 @@ def _spread_error(map: Map, loop: Pair, sigma_rad: float) -> float:
     """Optimize the pose graph with the new loop and move the points along; returns how far keyframes moved, m."""
     keyframes = map.alive_keyframes
     R, p = map.keyframes.R[keyframes], map.keyframes.p[keyframes]
-    a, b, n_shared = _present_edges(map, keyframes)
+    a, b, n_shared = present_edges(map, keyframes)
     R_ab = R[a].transpose(0, 2, 1) @ R[b]
     p_ab = np.einsum("nji,nj->ni", R[a], p[b] - p[a])
     row = np.full(len(map.keyframes), -1)
@@ -78,20 +78,20 @@ def _spread_error(map: Map, loop: Pair, sigma_rad: float) -> float:
     a = np.concatenate([a, row[map.loops.a[closed]], row[[loop.a]]])
     b = np.concatenate([b, row[map.loops.b[closed]], row[[loop.b]]])
     n_shared = np.concatenate([n_shared, np.full(len(closed) + 1, loop.inliers)])
-    depth_m = np.array([_median_distance(map, int(k)) for k in keyframes])
+    depth_m = np.array([median_distance(map, int(k)) for k in keyframes])
     graph = PoseGraph(
         R, p, map.keyframes.parent[keyframes] < 0, a, b,
         np.concatenate([R_ab, map.loops.R[closed], loop.T_a_b.R[None]]),
         np.concatenate([p_ab, map.loops.p[closed], loop.T_a_b.t[None]]),
-        _information(n_shared, depth_m[a], sigma_rad),
+        edge_information(n_shared, depth_m[a], sigma_rad),
     )  # fmt: skip
     result = optimize_pose_graph(graph)
-    _move_points(map, keyframes, R, p, result.R, result.p)
+    move_points(map, keyframes, R, p, result.R, result.p)
     map.keyframes.R[keyframes], map.keyframes.p[keyframes] = result.R, result.p
     return float(np.linalg.norm(result.p - p, axis=1).max())
 
 
-def _present_edges(map: Map, keyframes: Ints) -> tuple[Ints, Ints, Ints]:
+def present_edges(map: Map, keyframes: Ints) -> tuple[Ints, Ints, Ints]:
     """Rows (a, b) of keyframes joined by the spanning tree or by many common points, and how many those are."""
     row = {int(keyframe): i for i, keyframe in enumerate(keyframes)}
     edges = []
@@ -106,14 +106,14 @@ def _present_edges(map: Map, keyframes: Ints) -> tuple[Ints, Ints, Ints]:
     return table[:, 0], table[:, 1], table[:, 2]
 
 
-def _median_distance(map: Map, keyframe: int) -> float:
+def median_distance(map: Map, keyframe: int) -> float:
     """From a keyframe to its points, m."""
     point = map.points_of(keyframe)
     distance = np.linalg.norm(map.points.xyz[point[point >= 0]] - map.keyframes.p[keyframe], axis=1)
     return float(np.median(distance)) if len(distance) else 1.0
 
 
-def _information(n_shared: Ints, depth_m: Array, sigma_rad: float) -> Array:
+def edge_information(n_shared: Ints, depth_m: Array, sigma_rad: float) -> Array:
     """(E, 6, 6) of relative poses that hang on n points seen with sigma_rad at a distance: their mean, at best."""
     sigma = np.maximum(sigma_rad / np.sqrt(n_shared), 1e-9)
     out = np.zeros((len(n_shared), 6, 6))
@@ -123,7 +123,7 @@ def _information(n_shared: Ints, depth_m: Array, sigma_rad: float) -> Array:
     return out
 
 
-def _move_points(map: Map, keyframes: Ints, R_old: Array, p_old: Array, R_new: Array, p_new: Array) -> None:
+def move_points(map: Map, keyframes: Ints, R_old: Array, p_old: Array, R_new: Array, p_new: Array) -> None:
     """Carry every point along with the keyframe it was born in, or with one that sees it where that is gone."""
     points = map.alive_points
     reference = map.points.first_keyframe[points]
@@ -154,7 +154,7 @@ def _unite(map: Map, loop: Pair) -> None:
                 map.fuse_points(own, survivor)
 
 
-def _take_along(map: Map, R_before: Array, p_before: Array) -> None:
+def take_along(map: Map, R_before: Array, p_before: Array) -> None:
     """Keyframes that tracking inserted while the rest was adjusted follow their parents, and their points them."""
     n = len(R_before)
     late = np.arange(n, len(map.keyframes), dtype=np.int32)

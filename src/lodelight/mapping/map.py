@@ -33,6 +33,10 @@ class Map:
     points    : xyz (3,) m world, desc (4,), normal (3,) mean viewing direction, d_min, d_max m (where its scale can
                 be matched), head (first feature), n_obs, n_visible, n_found, first_keyframe, replaced_by, alive
     loops     : a, b (keyframes), R (3, 3), p (3,) of the measured T_a_b
+    tags      : name ("family id", UTF-8), size_m, R (3, 3), p (3,) of T_world_tag, covariance (6, 6), surveyed (R and
+                p are a survey's and are not adjusted), placed (R and p are known)
+    tag_views : keyframe, tag, R (3, 3), p (3,) of T_keyframe_body of the image, own (it is the keyframe's own image),
+                t_ns, px (4, 2), sigma_px (4,) of the corners, usable (no gate was against it)
     anchoring : what ties keyframes to the world; not saved
     lock      : held by whoever changes or reads several columns, for mapping on its own thread
     """
@@ -57,6 +61,14 @@ class Map:
             first_keyframe=(i32, ()), replaced_by=(i32, ()), alive=(np.bool_, ()),
         )  # fmt: skip
         self.loops = Table(a=(i32, ()), b=(i32, ()), R=(f64, (3, 3)), p=(f64, (3,)))
+        self.tags = Table(
+            name=("S80", ()), size_m=(f64, ()), R=(f64, (3, 3)), p=(f64, (3,)), covariance=(f64, (6, 6)),
+            surveyed=(np.bool_, ()), placed=(np.bool_, ()),
+        )  # fmt: skip
+        self.tag_views = Table(
+            keyframe=(i32, ()), tag=(i32, ()), R=(f64, (3, 3)), p=(f64, (3,)), own=(np.bool_, ()), t_ns=(i64, ()),
+            px=(f64, (4, 2)), sigma_px=(f64, (4,)), usable=(np.bool_, ()),
+        )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
         """Write the map file; see `lodelight.mapping.store.save_map`."""
@@ -101,6 +113,9 @@ class Map:
         k.covariance[:] = turn @ k.covariance @ turn.T
         p.xyz[:] = T_new_old @ p.xyz
         p.normal[:] = p.normal @ T_new_old.R.T
+        t = self.tags
+        t.R[:], t.p[:] = T_new_old.R @ t.R, T_new_old @ t.p
+        t.covariance[:] = turn @ t.covariance @ turn.T
 
     def feature_range(self, keyframe: int) -> slice:
         """The feature rows of a keyframe."""

@@ -9,15 +9,19 @@ import contextlib
 import json
 import platform
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import tomli_w
 
 from lodelight import __version__
+from lodelight.anchors import Anchors, Tag
 from lodelight.errors import SourceError
 from lodelight.evaluation.align import Mode
+from lodelight.io.anchors_toml import write_anchors
 from lodelight.io.clouds import write_ply
 from lodelight.io.covariances import write_covariances
 from lodelight.io.text import write_text
@@ -31,7 +35,7 @@ from lodelight.types import AnyArray
 
 FILES = (
     *("config.toml", "events.jsonl", "frames.csv", "trajectory.tum", "trajectory_live.tum", "covariance.csv"),
-    *("cloud.ply", "metrics.json", "report.html"),
+    *("cloud.ply", "anchors.toml", "metrics.json", "report.html"),
 )
 
 
@@ -91,13 +95,16 @@ class Outputs:
         compile_s: float,
         recording_s: float,
         align: Mode = "se3",
+        tags: Sequence[Tag] = (),
     ) -> dict[str, Any]:
         """Write every file and return what `metrics.json` holds.
 
         final : poses as known at the end; cloud_xyz : (N, 3) m map points
         map_stats : keyframes, map_points, gate, temporary_points, loops, relocalizations, and what else is worth saying
         wall_s : of the whole run; compile_s : spent in it on compiling; recording_s : length of what was run
-        align : how the error against the truth is measured (sim3 for a scale that was free)
+        align : how the error against the truth is measured (sim3 for a scale that was free; none for a path in the
+            world, of which the live one then counts from the frame on that was)
+        tags : as they were found; into `anchors.toml`, and their corners into the cloud
         """
         self.close()
         localized = [e for e in self._estimates if e.localized]
@@ -106,7 +113,8 @@ class Outputs:
         write_tum(self.out / "trajectory_live.tum", live)
         write_covariances(self.out / "covariance.csv", live.t_ns.tolist(), [e.covariance for e in localized])
         write_text(self.out / "frames.csv", self._frames_csv())
-        write_ply(self.out / "cloud.ply", cloud_xyz)
+        write_cloud(self.out / "cloud.ply", cloud_xyz, tags)
+        write_anchors(self.out / "anchors.toml", Anchors(tuple(tags)))
         statuses = [e.status for e in self._estimates]
         metrics: dict[str, Any] = {
             "frames": len(self._estimates),
@@ -121,7 +129,9 @@ class Outputs:
             "ate": None,
         }
         if truth is not None:
-            metrics["ate"] = {"final": ate_entry(final, truth, align), "live": ate_entry(live, truth, align)}
+            in_world = [e for e in localized if align != "none" or e.details.get("aligned", 1.0)]
+            then = Trajectory.from_poses([e.t_ns for e in in_world], [e.T_world_body for e in in_world])
+            metrics["ate"] = {"final": ate_entry(final, truth, align), "live": ate_entry(then, truth, align)}
         metrics = plain(metrics)
         write_text(self.out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
         write_report(self.out, truth, align)
@@ -153,6 +163,15 @@ class Outputs:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         with contextlib.suppress(SourceError) if error else contextlib.nullcontext():
             self.close()
+
+
+def write_cloud(path: Path, xyz: AnyArray, tags: Sequence[Tag]) -> None:
+    """Points (N, 3) m with `tag` 0, then four corners of each placed tag with its number, which comments name."""
+    placed = [tag for tag in tags if tag.corners_world is not None]
+    corners = [tag.corners_world for tag in placed if tag.corners_world is not None]
+    number = np.concatenate([np.zeros(len(xyz)), np.repeat(np.arange(1, len(placed) + 1), 4)]).astype(np.int32)
+    comments = [f"tag {i} is {tag.family} {tag.id}" for i, tag in enumerate(placed, 1)]
+    write_ply(path, np.concatenate([xyz, *corners]), comments=comments, tag=number)
 
 
 def versions() -> dict[str, str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from lodelight.fiducials import fiducial_modules
+from lodelight.fiducials import fiducial_modules, qr_modules
 from lodelight.sim.textures import power_of_two
 from lodelight.types import Array, ArrayF32
 
@@ -65,12 +65,7 @@ def _code(modules: Array, quiet: int) -> tuple[ArrayF32, float]:
 
 def qr(payload: str) -> tuple[ArrayF32, float]:
     """A QR code, and its side with quiet zone over that without."""
-    params = cv2.QRCodeEncoder_Params()  # type: ignore[attr-defined, unused-ignore]
-    params.correction_level = cv2.QRCodeEncoder_CORRECT_LEVEL_M
-    image = cv2.QRCodeEncoder_create(params).encode(payload) > 127  # type: ignore[attr-defined, unused-ignore]
-    dark = np.flatnonzero(~image.all(axis=1))  # the encoder frames the code as it likes
-    code = image[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1]
-    return _code(code.astype(float), QUIET_QR)
+    return _code(qr_modules(payload).astype(float), QUIET_QR)
 
 
 def fiducial(family: str, number: int) -> tuple[ArrayF32, float]:
