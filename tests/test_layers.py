@@ -9,7 +9,7 @@ SRC = Path(__file__).parents[1] / "src"
 LAYERS = [
     ["__main__"],
     ["cli"],
-    ["slam", "localizer"],
+    ["slam", "localizer", "doctor"],
     ["localization"],
     ["mapping"],
     ["estimation"],

@@ -24,6 +24,7 @@ COMMANDS = {
     "sim": ("lodelight.cli.sim", "Render a named building as a recording with ground truth, rig and anchors."),
     "run": ("lodelight.cli.run", "SLAM over a recording: trajectory, map and report."),
     "localize": ("lodelight.cli.localize", "Find and follow a camera in a saved map, which is never changed."),
+    "doctor": ("lodelight.cli.doctor", "Check a recording and its calibration: what is wrong, and by how much."),
     "convert": ("lodelight.cli.convert", "Turn any readable recording, trajectory or rig into a writable one."),
     "eval": ("lodelight.cli.evaluate", "Compare a trajectory with the truth: ATE, RPE, coverage, NEES."),
     "lights": (

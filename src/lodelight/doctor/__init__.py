@@ -1,0 +1,1 @@
+"""What is wrong with a recording or its calibration, and by how much."""
