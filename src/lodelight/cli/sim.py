@@ -46,7 +46,7 @@ def sim(
         raise typer.BadParameter("name a building and a folder, as in: lodelight sim office --out office.")
     from lodelight.cli.progress import track
     from lodelight.sim.plan import write_plan
-    from lodelight.sim.recorder import record
+    from lodelight.sim.recorder import claim, record
     from lodelight.sim.scenarios import Request, prepare
 
     request = Request(
@@ -71,7 +71,9 @@ def sim(
         imu=imu_model,
         faults=tuple(fault),
     )
-    simulation = prepare(request, threads)
+    if out is not None:
+        claim(out)
+    simulation = prepare(request, threads, lit=out is not None)
     if plan is not None:
         write_plan(plan, simulation.building, simulation.motion)
     if out is not None:

@@ -22,6 +22,7 @@ from lodelight.sim.scene import Lamp, Scene, assemble
 from lodelight.types import Array, ArrayF32
 
 DECAL_GAP_M = 0.004  # nearer to its wall a picture would fight with it for the pixels
+TAG_GAP_M = 0.008  # codes are stuck over pictures
 MOVED_SHARE, MOVED_M, DARK_SHARE = 0.5, 0.35, 0.15  # what a `changed` building changes
 FREQUENCIES_HZ = range(2000, 8001, 200)  # above flicker, below half of a phone camera's row rate (science note A1)
 PANEL_LM, DISC_LM = 3600.0, 900.0
@@ -139,7 +140,7 @@ class Builder:
         surveyed : a QR code that says itself where it hangs. Anchors know the place of every tag.
         """
         a = math.radians(yaw_deg)
-        x, y = x + DECAL_GAP_M * math.cos(a), y + DECAL_GAP_M * math.sin(a)
+        x, y = x + TAG_GAP_M * math.cos(a), y + TAG_GAP_M * math.sin(a)
         R = np.array([[-math.sin(a), 0, -math.cos(a)], [math.cos(a), 0, -math.sin(a)], [0.0, -1.0, 0.0]])
         T = self.mesh.frame @ SE3(R, np.array([x, y, z]))
         label = f"Q{number:02d}" if family == "qr" else str(number)

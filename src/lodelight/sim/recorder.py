@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -98,7 +99,7 @@ def record(
     else or cannot be written. progress : wraps the rendering, given the steps and their number.
     """
     out = Path(out)
-    _claim(out, simulation.settings)
+    claim(out, simulation.settings)
     folders = write_sensors(out, simulation.stated or simulation.rig, str(simulation.settings.get("scenario", "")))
     _write_texts(simulation, out, folders)
     done = {name: set(written_stamps(folder)) for name, folder in folders.items() if (folder / "data.csv").exists()}
@@ -110,18 +111,26 @@ def record(
     return out
 
 
-def _claim(out: Path, settings: dict[str, object]) -> None:
-    """Take a new or empty folder, or one that the same simulation began; refuse any other."""
+def claim(out: str | Path, settings: dict[str, object] | None = None) -> None:
+    """Take a new or empty folder, or one that the same simulation began. Raises SourceError on any other.
+
+    settings : None = not known yet; then only what can be told without them is
+    """
+    out = Path(out)
     text = json.dumps(settings, indent=2, sort_keys=True) + "\n"
     try:
         out.mkdir(parents=True, exist_ok=True)
         holds = sorted(p.name for p in out.iterdir())
     except OSError as error:
         raise SourceError(f"cannot write to {out}: {error.strerror}; choose another --out") from None
+    if not os.access(out, os.W_OK):
+        raise SourceError(f"cannot write to {out}: no permission; choose another --out")
+    if holds and SETTINGS not in holds:
+        raise SourceError(f"{out} is not empty ({holds[0]} is there); choose a new folder for --out")
+    if settings is None:
+        return
     if not holds:
         write_text(out / SETTINGS, text)
-    elif SETTINGS not in holds:
-        raise SourceError(f"{out} is not empty ({holds[0]} is there); choose a new folder for --out")
     elif read_text(out / SETTINGS) != text:
         raise SourceError(
             f"{out} holds a recording made with other settings (see its {SETTINGS}); choose another --out"

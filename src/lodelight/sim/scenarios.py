@@ -28,7 +28,7 @@ from lodelight.sim.imu import SPECS, TURN_ON, ImuSeries, read_out
 from lodelight.sim.lightmap import bake
 from lodelight.sim.motion import Motion
 from lodelight.sim.paths import another_way
-from lodelight.sim.recorder import Simulation, record
+from lodelight.sim.recorder import Simulation, claim, record
 from lodelight.sim.space import Space
 from lodelight.types import Array
 
@@ -97,34 +97,36 @@ def simulate(
 
     Raises ConfigError on what cannot be simulated and SourceError on files that cannot be read or written.
     """
+    claim(out)
     simulation = prepare(Request(scenario, **choices), threads)
     return record(simulation, out, threads, progress)
 
 
-def prepare(request: Request, threads: int = 2) -> Simulation:
-    """Everything but the images: the building with its light, the motion in it, the sensors."""
+def prepare(request: Request, threads: int = 2, lit: bool = True) -> Simulation:
+    """Everything but the images: the building with its light (unless not `lit`), the motion in it, the sensors."""
     _check(request)
     rig = _rig(request)
     given = _given_motion(request)
     faults = Faults.parse(request.faults, given.duration_s if given else _duration(request))
-    place = building(request.scenario, request.seed, request.changed, faults, threads)
+    series: ImuSeries | None = None
+    if given is not None and request.imu_file is not None:
+        series = _passed_imu(Path(request.imu_file), given, request)
+    place = unlit(request.scenario, request.seed, request.changed, faults)
     if given is None:
         motion = _route_motion(request, place, faults)
     else:
         motion = _placed(request, given, place)
     Space(place).check(motion)
-    if request.imu_file is not None:
-        series: ImuSeries | None = _passed_imu(Path(request.imu_file), motion, request)
-    elif rig.imu is not None:
+    if series is None and rig.imu is not None:
         series = read_out(motion, rig.imu, np.random.default_rng([request.seed, 2]), TURN_ON[request.imu])
-    else:
-        series = None
     given_files = {name: _digest(name) for name in (request.trajectory, request.imu_file, request.rig) if name}
     settings = asdict(request) | {
         "files": {name: digest for name, digest in given_files.items() if digest},
         "trajectory_deviation_m": motion.deviation_m,
         "trajectory_deviation_deg": motion.deviation_deg,
     }
+    if lit:  # last, since it takes longest
+        bake(place.scene, threads)
     true_rig = faults.true_rig(rig, np.random.default_rng([request.seed, 3]))
     return Simulation(place, motion, true_rig, series, request.seed, faults, rig, settings)
 
@@ -133,12 +135,17 @@ def building(
     name: str, seed: int = 0, changed: bool = False, faults: Faults | None = None, threads: int = 2
 ) -> Building:
     """A named building with its light baked. Raises ConfigError on an unknown name."""
+    out = unlit(name, seed, changed, faults)
+    bake(out.scene, threads)
+    return out
+
+
+def unlit(name: str, seed: int = 0, changed: bool = False, faults: Faults | None = None) -> Building:
+    """A named building in the dark."""
     module = _module(name)
     builder = Builder(name, seed, module.ROUTE, module.HEIGHT, changed, faults or Faults())
     module.build(builder)
-    out = builder.finish()
-    bake(out.scene, threads)
-    return out
+    return builder.finish()
 
 
 def _module(name: str) -> Any:
