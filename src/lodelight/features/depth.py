@@ -19,16 +19,21 @@ SCALE_ERROR = 0.005
 
 
 def depth_of_features(features: Features, depth: ArrayF32, spec: DepthSpec) -> Features:
-    """Features with inverse depth and its sigma, read at the nearest pixel of `depth` (H, W) m; 0 = no reading.
+    """Features with inverse depth and its sigma, as `depth_at` reads them."""
+    return features.with_depth(*depth_at(features.px, depth, spec))
+
+
+def depth_at(px: ArrayF32, depth: ArrayF32, spec: DepthSpec) -> tuple[ArrayF32, ArrayF32]:
+    """Inverse depth and its sigma (N,) 1/m, read at the pixel of `depth` (H, W) m nearest to each px; 0 = no reading.
 
     sigma_z^2 = (a + b (z - c)^2)^2 + (scale error z)^2 + (half the spread of depths around)^2: where the depth changes
     from pixel to pixel, as on the rim of an object, a misregistered reading says little.
     """
-    z, spread = _read(features.px, depth)
+    z, spread = _read(px, depth)
     a, b, c = spec.noise
     sigma_z = np.sqrt((a + b * (z - c) ** 2) ** 2 + (SCALE_ERROR * z) ** 2 + (0.5 * spread) ** 2)
     inv_depth = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
-    return features.with_depth(inv_depth, sigma_z * inv_depth**2)
+    return inv_depth, sigma_z * inv_depth**2
 
 
 @kernel
