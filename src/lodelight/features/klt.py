@@ -20,11 +20,12 @@ from lodelight.features.depth import depth_at
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.triangulate import triangulate_pairs
-from lodelight.geometry.two_view import fit_two_view
+from lodelight.geometry.two_view import fit_two_view, turn_between
 from lodelight.messages import Frame
 from lodelight.rig import CameraSpec, Rig
 from lodelight.types import AnyArray, Array, ArrayF32, Bools, Bytes, Ints
 
+UNAIDED_SIGMA = 0.01  # rad: of a turn by the images alone, which takes part of the translation for turning
 STEREO_BOUND = 2.0  # what calibration adds to the noise across the epipolar plane
 
 
@@ -93,11 +94,12 @@ class Tracks:
 @dataclass(frozen=True, eq=False)
 class Flow:
     """What became of the tracks of the last frame: rotation, R_now_last (3, 3) of camera 0, as the images have it;
-    parallax_rad, the median of what translation moved; followed of `before` tracks; rejected ones left the common
-    motion."""
+    parallax_rad, the median of what translation moved; moved_px, of the whole; followed of `before` tracks; rejected
+    ones left the common motion."""
 
     R_now_last: Array
     parallax_rad: float = 0.0
+    moved_px: float = 0.0
     before: int = 0
     followed: int = 0
     rejected: int = 0
@@ -133,7 +135,7 @@ class KltTracker:
         """Tracks of a frame.
 
         R_now_last : (3, 3) of camera 0 since the last frame, as believed, each axis within sigma_rotation rad;
-            None: nothing is known of it
+            None: by the images alone
         Raises SourceError where an image is not of the rig's size.
         """
         _check_size(frame.images[0], self.spec)
@@ -184,10 +186,13 @@ class KltTracker:
         ray, real = self.camera.unproject(px[keep])
         keep, ray = keep[real], ray[real]
         sigma = self.config.sigma_px / self.camera.focal_px
+        if R_now_last is None:
+            R, sigma_rotation = turn_between(old.ray[keep], ray), UNAIDED_SIGMA
         R, _, right, parallax = fit_two_view(
             old.ray[keep], ray, np.ascontiguousarray(R), sigma_rotation, sigma, self.config.bound, self._seed
         )
-        self.flow = Flow(R, parallax, len(old), len(keep), int(np.count_nonzero(~right)))
+        moved = float(np.median(np.linalg.norm(px[keep] - old.px[keep], axis=1))) if len(keep) else 0.0
+        self.flow = Flow(R, parallax, moved, len(old), len(keep), int(np.count_nonzero(~right)))
         keep, ray = keep[right], ray[right]
         n, none = len(keep), np.zeros(len(keep))
         alone = np.full((n, 2), np.nan, np.float32)

@@ -81,6 +81,39 @@ def fit_two_view(
 
 
 @kernel
+def turn_between(ray_a: Array, ray_b: Array) -> Array:
+    """R_b_a (3, 3) that brings most rays of a onto those of b: nearly right where the translation moves them little.
+
+    Reweighted least squares with Cauchy's kernel at the median error.
+    """
+    R = np.eye(3)
+    n = len(ray_a)
+    error, g, c = np.empty(n), np.empty((n, 3)), np.empty((n, 3))
+    for _ in range(10):
+        _normals(ray_a, ray_b, R, g, c)
+        for k in range(n):
+            error[k] = c[k, 0] ** 2 + c[k, 1] ** 2 + c[k, 2] ** 2
+        scale = max(float(np.median(error)), 1e-10) if n else 1.0
+        H, d = np.zeros((3, 3)), np.zeros(3)
+        for k in range(n):
+            w = 1.0 / (1.0 + error[k] / scale)
+            for i in range(3):
+                d[i] += w * c[k, i]
+                H[i, i] += w
+                for j in range(i + 1):
+                    H[i, j] -= w * g[k, i] * g[k, j]
+        for i in range(3):
+            H[i, i] += 1e-9
+        if not cholesky(H):
+            break
+        cholesky_solve(H, d)
+        R = matmul(so3_exp(d), R)
+        if d[0] ** 2 + d[1] ** 2 + d[2] ** 2 < 1e-14:
+            break
+    return R
+
+
+@kernel
 def _cross(a: Array, b: Array, out: Array) -> None:
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]

@@ -1,0 +1,320 @@
+"""Where an inertial system begins: at rest, or in motion. While it cannot, it says what is missing, and by how much.
+
+At rest, the accelerometer shows where up is and the gyroscope its bias. In motion, `alignment` finds gravity, velocity
+and biases from what one or two seconds of images and samples say together; one camera needs to be accelerated for
+that, two cameras or depth only to see. Derivation: docs/inertial.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lodelight.errors import SourceError
+from lodelight.geometry.se3 import SE3
+from lodelight.geometry.so3 import so3_log
+from lodelight.geometry.two_view import fit_two_view
+from lodelight.imu.alignment import Alignment, Motions, Rows, align
+from lodelight.imu.gyro_bias import gyro_bias
+from lodelight.imu.preintegration import NavState, Preintegration, preintegrate
+from lodelight.imu.samples import ImuSamples
+from lodelight.imu.units import accelerometer_fault, gyroscope_fault
+from lodelight.rig import ImuSpec
+from lodelight.types import AnyArray, Array
+
+GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """rest_s : standing still for so long starts; longest_s : of images that are kept; shortest_s : in motion
+    rest_px, rest_gyro, rest_accel : standing still moves the image by no more (median), and deviates by no more,
+        rad/s and m/s^2
+    min_tracks : landmarks seen from the first to the last image
+    min_parallax_deg : of them, what one camera alone needs
+    max_scale, max_tilt_deg, max_velocity : standard deviations above which it is too early; m/s
+    sigma_px : of a ray in the alignment. Several times a track's own: errors of one track are alike from frame to
+        frame, and the IMU's own noise is not modelled there
+    bias_gyro, bias_accel : deviations of the biases before anything is known, rad/s and m/s^2
+    """
+
+    rest_s: float = 0.4
+    shortest_s: float = 0.7
+    longest_s: float = 1.9
+    rest_px: float = 0.5
+    rest_gyro: float = 0.02
+    rest_accel: float = 0.25
+    min_tracks: int = 25
+    min_parallax_deg: float = 1.0
+    max_scale: float = 0.06
+    max_tilt_deg: float = 2.0
+    max_velocity: float = 0.15
+    sigma_px: float = 2.0
+    bias_gyro: float = 0.05
+    bias_accel: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class StartView:
+    """What one image saw: one row for each track and camera, sorted by nothing.
+
+    track (N,), camera (N,); ray (N, 3) unit, in that camera; inv_depth, sigma_inv_depth (N,) 1/m, 0 = none
+    R_now_last : (3, 3) turn of camera 0 since the image before, by the images alone
+    """
+
+    t_ns: int
+    track: NDArray[np.int64]
+    camera: AnyArray
+    ray: Array
+    inv_depth: Array
+    sigma_inv_depth: Array
+    R_now_last: Array
+
+    def first_camera(self) -> tuple[NDArray[np.int64], Array]:
+        """Tracks and rays of camera 0."""
+        own = self.camera == 0
+        return self.track[own], self.ray[own]
+
+
+@dataclass(frozen=True, eq=False)
+class Started:
+    """States of the body at the images that were kept, in a frame whose z points up and whose origin is the first.
+
+    how : "at rest" or "in motion"; why : in words, with figures
+    sigma_tilt rad, sigma_velocity m/s, sigma_bias_gyro rad/s, sigma_bias_accel m/s^2 : of the first state
+    """
+
+    how: str
+    why: str
+    states: list[NavState]
+    sigma_tilt: float
+    sigma_velocity: float
+    sigma_bias_gyro: float
+    sigma_bias_accel: float
+
+
+class Starter:
+    """Collects images with the samples between them until they suffice. T_body_cam : of every camera with rows."""
+
+    def __init__(
+        self, spec: ImuSpec, T_body_cam: Sequence[SE3], focal_px: float, metric: bool, config: StartConfig | None = None
+    ) -> None:
+        """metric : rows have depth, or a second camera"""
+        self.config = config or StartConfig()
+        self.spec = spec
+        self.T_body_cam = list(T_body_cam)
+        self.focal_px = focal_px
+        self.metric = metric
+        self.views: list[StartView] = []
+        self.imu: list[ImuSamples] = []  # imu[i] from views[i] to views[i + 1]
+
+    def reset(self) -> None:
+        self.views, self.imu = [], []
+
+    def add(self, view: StartView, imu: ImuSamples | None) -> None:
+        """The next image, and the samples from the one before; None where there are none, and all before is forgotten."""
+        if imu is None:
+            self.reset()
+        elif self.views:
+            self.imu.append(imu)
+        self.views.append(view)
+        while len(self.views) > 2 and self._span_s > self.config.longest_s:
+            del self.views[0], self.imu[0]
+
+    @property
+    def _span_s(self) -> float:
+        return (self.views[-1].t_ns - self.views[0].t_ns) * 1e-9 if self.views else 0.0
+
+    def find(self) -> Started | str:
+        """The start, or what is missing. Raises SourceError where the IMU's units are wrong."""
+        c = self.config
+        if len(self.views) < 3 or self._span_s < c.rest_s:
+            return f"{self._span_s:.2f} s of images and IMU so far; {c.rest_s:.2f} s are needed standing still, {c.shortest_s:.2f} s in motion"
+        fault = accelerometer_fault(np.vstack([s.accel for s in self.imu])) or self._gyro_fault()
+        if fault:
+            raise SourceError(f"{fault} (or correct the recording's IMU)")
+        at_rest = self._at_rest()
+        if isinstance(at_rest, Started):
+            return at_rest
+        if self._span_s < c.shortest_s:
+            return f"{at_rest}; in motion {c.shortest_s:.2f} s are needed, there are {self._span_s:.2f}"
+        in_motion = self._in_motion()
+        return in_motion if isinstance(in_motion, Started) else f"{at_rest}; {in_motion}"
+
+    # -- at rest ------------------------------------------------------------------------------------------------
+
+    def _at_rest(self) -> Started | str:
+        c = self.config
+        first = max(i for i, v in enumerate(self.views) if self.views[-1].t_ns - v.t_ns >= c.rest_s * 1e9)
+        gyro = np.vstack([s.gyro for s in self.imu[first:]])
+        accel = np.vstack([s.accel for s in self.imu[first:]])
+        moved_px = self._moved_px(first)
+        shakes = [
+            (moved_px, c.rest_px, "the image moves by {:.1f} px, at rest {:.1f}"),
+            (float(gyro.std(axis=0).max()), c.rest_gyro, "the gyroscope deviates by {:.3f} rad/s, at rest {:.3f}"),
+            (float(accel.std(axis=0).max()), c.rest_accel, "the accelerometer deviates by {:.2f} m/s^2, at rest {:.2f}"),
+        ]
+        for value, most, text in shakes:
+            if value > most:
+                return "in motion: " + text.format(value, most)
+        bias = gyro.mean(axis=0)
+        if np.linalg.norm(bias) > 0.5:
+            return f"in motion: the gyroscope reads {np.linalg.norm(bias):.2f} rad/s, too much for a bias"
+        up = accel.mean(axis=0)
+        T = SE3(upright(-up), np.zeros(3))
+        states = [NavState(v.t_ns, T, np.zeros(3), bias, np.zeros(3)) for v in self.views[first:]]
+        n = len(gyro)
+        tilt = math.hypot(c.bias_accel, float(accel.std(axis=0).max()) / math.sqrt(n)) / GRAVITY_M_S2
+        why = f"at rest for {c.rest_s:.2f} s; gyroscope bias {np.linalg.norm(bias):.4f} rad/s"
+        sigma_bias = max(float(gyro.std(axis=0).max()) / math.sqrt(n), 1e-3)
+        return Started("at rest", why, states, tilt, 0.02, sigma_bias, c.bias_accel)
+
+    def _moved_px(self, first: int) -> float:
+        """Median displacement of camera 0's tracks since an image; a great deal where none is left."""
+        track_a, ray_a = self.views[first].first_camera()
+        track_b, ray_b = self.views[-1].first_camera()
+        _, a, b = np.intersect1d(track_a, track_b, return_indices=True)
+        if len(a) < self.config.min_tracks:
+            return math.inf if len(track_a) >= self.config.min_tracks else 0.0
+        return float(np.median(np.linalg.norm(ray_a[a] - ray_b[b], axis=1))) * self.focal_px
+
+    # -- in motion ----------------------------------------------------------------------------------------------
+
+    def _in_motion(self) -> Started | str:
+        c = self.config
+        track_a, ray_a = self.views[0].first_camera()
+        track_b, _ = self.views[-1].first_camera()
+        lasting = len(np.intersect1d(track_a, track_b))
+        rows = self._rows()
+        if lasting < c.min_tracks and len(rows.start) - 1 < 2 * c.min_tracks:
+            return f"{lasting} tracks last for {self._span_s:.1f} s, {c.min_tracks} are needed"
+        bias = self._gyro_bias()
+        motions = self._motions(bias)
+        if not self.metric:
+            parallax = self._parallax_deg(motions)
+            if parallax < c.min_parallax_deg:
+                return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
+        sigma_ray = c.sigma_px / self.focal_px
+        found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray, (0.2 * c.bias_gyro, c.bias_accel))
+        if isinstance(found, str):
+            return found
+        missing = self._missing(found)
+        return missing or self._started(found)
+
+    def _rows(self) -> Rows:
+        """Sightings of the tracks that were seen at least four times, or measured in depth, sorted by track."""
+        track = np.concatenate([v.track for v in self.views])
+        frame = np.repeat(np.arange(len(self.views)), [len(v.track) for v in self.views])
+        camera, ray, inv_depth, sigma = (
+            np.concatenate([getattr(v, name) for v in self.views])
+            for name in ("camera", "ray", "inv_depth", "sigma_inv_depth")
+        )
+        _, which, count = np.unique(track, return_inverse=True, return_counts=True)
+        kept = np.flatnonzero(count[which] >= 4)
+        order = kept[np.lexsort((camera[kept], frame[kept], track[kept]))]
+        _, landmark = np.unique(track[order], return_inverse=True)
+        return Rows(
+            frame[order].astype(np.int32), camera[order].astype(np.int32), landmark.astype(np.int32),
+            np.ascontiguousarray(ray[order]), inv_depth[order], sigma[order],
+        )  # fmt: skip
+
+    def _motions(self, bias: Array) -> list[Preintegration]:
+        """From the first image to every other."""
+        out = [preintegrate(self.imu[0], bias, np.zeros(3), self.spec)]
+        for samples in self.imu[1:]:
+            out.append(out[-1].extended(samples))
+        return out
+
+    def _gyro_bias(self) -> Array:
+        """From frame to frame first, then between frames farther apart, which tell it more sharply."""
+        R = self.T_body_cam[0].R
+        none = np.zeros(3)
+        steps = [preintegrate(s, none, none, self.spec) for s in self.imu]
+        bias, _ = gyro_bias(steps, [R @ v.R_now_last.T @ R.T for v in self.views[1:]])
+        sigma_ray = 0.5 / self.focal_px
+        for gap in (3, 6):
+            motions, seen = [], []
+            for i in range(0, len(self.views) - gap, 2):
+                samples = self.imu[i]
+                for later in self.imu[i + 1 : i + gap]:
+                    samples = samples.joined(later)
+                motion = preintegrate(samples, bias, none, self.spec)
+                track_a, ray_a = self.views[i].first_camera()
+                track_b, ray_b = self.views[i + gap].first_camera()
+                _, a, b = np.intersect1d(track_a, track_b, return_indices=True)
+                if len(a) < self.config.min_tracks:
+                    continue
+                believed = np.ascontiguousarray(R.T @ motion.dR.T @ R)
+                turn, _, _, _ = fit_two_view(ray_a[a], ray_b[b], believed, 0.04 * motion.dt_s, sigma_ray, 3.0, 1)
+                motions.append(motion)
+                seen.append(R @ turn.T @ R.T)
+            if len(motions) >= 2:
+                bias, _ = gyro_bias(motions, seen)
+        return bias
+
+    def _gyro_fault(self) -> str:
+        R = self.T_body_cam[0].R
+        none = np.zeros(3)
+        seen = np.stack([so3_log(np.ascontiguousarray(R @ v.R_now_last.T @ R.T)) for v in self.views[1:]])
+        dt_s = [(s.t_ns[-1] - s.t_ns[0]) * 1e-9 for s in self.imu]
+        turned = np.stack([np.trapezoid(s.gyro, (s.t_ns - s.t_ns[0]) * 1e-9, axis=0) for s in self.imu])
+        del none
+        return gyroscope_fault(turned, seen, float(np.sum(dt_s)))
+
+    def _parallax_deg(self, motions: list[Preintegration]) -> float:
+        """Median angle that translation moved the tracks by, from the first image to that where it is largest."""
+        R = self.T_body_cam[0].R
+        track_a, ray_a = self.views[0].first_camera()
+        best = 0.0
+        for view, motion in zip(self.views[1::3], motions[::3], strict=False):
+            track_b, ray_b = view.first_camera()
+            _, a, b = np.intersect1d(track_a, track_b, return_indices=True)
+            if len(a) >= self.config.min_tracks:
+                turned = ray_b[b] @ (R.T @ motion.dR @ R).T
+                best = max(best, float(np.median(np.linalg.norm(np.cross(ray_a[a], turned), axis=1))))
+        return math.degrees(best)
+
+    def _missing(self, found: Alignment) -> str:
+        c = self.config
+        if found.behind > 0.5:
+            raise SourceError(
+                f"{found.behind:.0%} of the landmarks come to lie behind the camera: the accelerometer's sign is turned "
+                "(at rest it must read +9.81 m/s^2 upwards); negate it"
+            )
+        if found.inliers < 0.6 * found.n:
+            return f"{found.inliers} of {found.n} sightings agree with the IMU; check the camera's pose and the clocks"
+        shares = [
+            (0.0 if self.metric else found.sigma_scale, c.max_scale, "scale known to {:.0%}, {:.0%} are needed: accelerate"),
+            (math.degrees(found.sigma_tilt), c.max_tilt_deg, "gravity known to {:.1f} deg, {:.1f} are needed: turn"),
+            (found.sigma_velocity, c.max_velocity, "velocity known to {:.2f} m/s, {:.2f} are needed"),
+        ]
+        return next((text.format(value, most) for value, most, text in shares if not value < most), "")
+
+    def _started(self, found: Alignment) -> Started:
+        R0 = upright(found.gravity)
+        states = [
+            NavState(view.t_ns, SE3(R0 @ R, R0 @ p), R0 @ v, found.bias_gyro, found.bias_accel)
+            for view, R, p, v in zip(self.views, found.R, found.p, found.v, strict=True)
+        ]
+        why = (
+            f"in motion: {self._span_s:.2f} s of images, {found.path_m:.2f} m, scale known to {found.sigma_scale:.1%}, "
+            f"gravity to {math.degrees(found.sigma_tilt):.2f} deg"
+        )
+        sigma = np.sqrt(np.diag(found.covariance))
+        return Started(
+            "in motion", why, states, found.sigma_tilt, float(sigma[2:5].max()), float(sigma[5:8].max()),
+            float(sigma[8:].max()),
+        )  # fmt: skip
+
+
+def upright(down: Array) -> Array:
+    """R_world_body (3, 3) with `down` (3,), as the body sees it, along -z, and the body's x axis ahead of the world's."""
+    z = -down / np.linalg.norm(down)
+    forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 0.0, -1.0 if z[0] > 0 else 1.0])
+    x = forward - (forward @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])

@@ -1,0 +1,1 @@
+"""Visual-inertial odometry: images and IMU to a smooth path, in real time."""

@@ -1,0 +1,308 @@
+"""Visual-inertial odometry: messages in, a smooth path out. Read `_step` first.
+
+The `map` frame: z up, its origin where the start was; it never jumps while the window lives. When the window fails,
+a new one begins, and goes on where the old one was left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lodelight.estimation.window import Observations, Solution, StartSigma, TagView, Window, WindowConfig
+from lodelight.features.klt import KltConfig, KltTracker, Tracks
+from lodelight.geometry.se3 import SE3
+from lodelight.imu.initialization import StartConfig, Started, Starter, StartView
+from lodelight.imu.preintegration import NavState
+from lodelight.imu.samples import ImuSamples
+from lodelight.imu.stream import ImuStream
+from lodelight.messages import Frame, Imu, Status
+from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
+from lodelight.rig import Rig
+from lodelight.types import Array
+
+EventSink = Callable[..., None]
+UNKNOWN_15 = np.diag(np.repeat([math.pi**2, 1e6, 1e4, 1.0, 10.0], 3))
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """few_tracks : in agreement with the window, below which a frame is degraded
+    blind_s : without them for so long, and the IMU alone is believed no more
+    most_speed m/s, most_bias_gyro rad/s, most_bias_accel m/s^2 : a window that believes more has failed
+    start_iterations : of the first solution; sigma_px : noise of a track in the window
+    """
+
+    few_tracks: int = 15
+    blind_s: float = 1.0
+    most_speed: float = 30.0
+    most_bias_gyro: float = 0.5
+    most_bias_accel: float = 2.0
+    start_iterations: int = 10
+    sigma_px: float = 1.0
+    klt: KltConfig = field(default_factory=KltConfig)
+    start: StartConfig = field(default_factory=StartConfig)
+    keyframes: KeyframeRule = field(default_factory=KeyframeRule)
+    window: WindowConfig = field(default_factory=WindowConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryStep:
+    """One frame. state : T_map_body, velocity and biases; covariance (15, 15) of it
+    keyframe : the reason why it is one, empty where it is none; why : of a status that is not plain tracking
+    restarted : this frame is the first of a new window
+    """
+
+    frame: Frame
+    status: Status
+    state: NavState
+    covariance: Array
+    tracks: Tracks
+    inliers: int = 0
+    keyframe: str = ""
+    why: str = ""
+    restarted: bool = False
+
+
+class InertialOdometry:
+    """sensors : "mono", "stereo" or "rgbd", with an IMU. on_event : told of starts, failures and faults of the IMU."""
+
+    def __init__(
+        self, rig: Rig, sensors: str, config: OdometryConfig | None = None, on_event: EventSink | None = None,
+        seed: int = 0,
+    ) -> None:  # fmt: skip
+        self.config = config or OdometryConfig()
+        assert rig.imu is not None
+        self.rig = rig.with_cameras(2 if sensors == "stereo" else 1)
+        self.spec = rig.imu
+        self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
+        self.tracker = KltTracker(rig, sensors, self.config.klt, seed)
+        self.stream = ImuStream(rig.imu, self.emit)
+        self.camera = rig.cameras[0].camera
+        self.R_body_cam = rig.cameras[0].T_body_cam.R
+        self.starter = Starter(
+            rig.imu, [c.T_body_cam for c in self.rig.cameras], self.camera.focal_px, sensors != "mono",
+            self.config.start,
+        )  # fmt: skip
+        self.window: Window | None = None
+        self.restarts = 0
+        self._pending: tuple[Frame, Sequence[TagView]] | None = None
+        self._last_ns: int | None = None
+        self._keyframe: LastKeyframe | None = None
+        self._blind_since: int | None = None
+        self._left_at: NavState | None = None  # where the last window was left
+        self._views: list[Tracks] = []  # of the starter's images
+
+    # -- messages -----------------------------------------------------------------------------------------------
+
+    def feed_imu(self, sample: Imu) -> OdometryStep | None:
+        """A sample; where a frame waited for it, that frame's step."""
+        self.stream.add(sample)
+        if self._pending is not None and self.stream.reaches(self._pending[0].t_ns):
+            return self.flush()
+        return None
+
+    def feed_frame(self, frame: Frame, tags: Sequence[TagView] = ()) -> OdometryStep | None:
+        """A frame. It waits for the sample behind it, so that its time is covered; a step is that of an earlier frame
+        or of this one."""
+        waited = self.flush()
+        self._pending = (frame, tags)
+        if waited is None and self.stream.reaches(frame.t_ns):
+            return self.flush()
+        return waited
+
+    def flush(self) -> OdometryStep | None:
+        """The frame that waits, if any, with the samples there are."""
+        if self._pending is None:
+            return None
+        (frame, tags), self._pending = self._pending, None
+        return self._step(frame, tags)
+
+    # -- one frame ----------------------------------------------------------------------------------------------
+
+    def _step(self, frame: Frame, tags: Sequence[TagView]) -> OdometryStep:
+        imu, missing = self._imu_since_last(frame.t_ns)
+        self._last_ns = frame.t_ns
+        if self.window is None:
+            return self._try_start(frame, imu, missing)
+        if imu is None:
+            return self._fail(frame, missing)
+        window = self.window
+        predicted = window.predict(frame.t_ns, imu)
+        R_now_last = self.R_body_cam.T @ predicted.T_world_body.R.T @ window.newest.T_world_body.R @ self.R_body_cam
+        tracks = self.tracker.process(frame, R_now_last, sigma_rotation=2e-3)
+        reason = self._keyframe_reason(tracks, predicted.T_world_body)
+        window.add_frame(frame.t_ns, imu, self._observations(tracks), tags, bool(reason), self._still(imu))
+        solution = window.solve()
+        state = window.newest
+        inliers = len(tracks) - len(solution.outliers)
+        failure = self._failure(solution, state) or self._blind(inliers, frame.t_ns)
+        if failure:
+            return self._fail(frame, failure)
+        self.tracker.drop(solution.outliers)
+        if reason:
+            self._keyframe = LastKeyframe(frame.t_ns, state.T_world_body, tracks)
+        blind = self._blind_since is not None
+        why = f"{inliers} tracks agree, fewer than {self.config.few_tracks}: the IMU carries the pose" if blind else ""
+        self.stream.forget_before(frame.t_ns)
+        return OdometryStep(
+            frame, "degraded" if blind else "tracking", state, window.covariance(), tracks, inliers, reason, why
+        )
+
+    def _imu_since_last(self, t_ns: int) -> tuple[ImuSamples | None, str]:
+        if self._last_ns is None:
+            return None, "the first frame"
+        found = self.stream.between(self._last_ns, t_ns)
+        return (None, found) if isinstance(found, str) else (found, "")
+
+    def _observations(self, tracks: Tracks) -> Observations:
+        right = np.flatnonzero(tracks.stereo)
+        n, m = len(tracks), len(right)
+        inv_depth, sigma = tracks.inv_depth, tracks.sigma_inv_depth
+        if m:  # what two cameras say is said by their pixels
+            inv_depth, sigma = np.zeros(n), np.zeros(n)
+        none = np.zeros(m)
+        return Observations(
+            np.concatenate([tracks.id, tracks.id[right]]),
+            np.concatenate([np.zeros(n, np.int32), np.ones(m, np.int32)]),
+            np.concatenate([tracks.px, tracks.px_right[right]]).astype(np.float64),
+            np.full(n + m, self.config.sigma_px),
+            np.concatenate([inv_depth, none]), np.concatenate([sigma, none]),
+        )  # fmt: skip
+
+    def _keyframe_reason(self, tracks: Tracks, T_map_body: SE3) -> str:
+        if self._keyframe is None:
+            return "the first"
+        return keyframe_reason(
+            self._keyframe, tracks, T_map_body, self.R_body_cam, self.camera.focal_px, self.config.keyframes
+        )
+
+    def _still(self, imu: ImuSamples) -> bool:
+        """Whether nothing moves: neither the tracks since the last frame, nor the IMU."""
+        c, flow = self.config.start, self.tracker.flow
+        quiet = imu.gyro.std(axis=0).max() < c.rest_gyro and imu.accel.std(axis=0).max() < c.rest_accel
+        return bool(quiet and flow.followed >= c.min_tracks and flow.moved_px < 0.5 * c.rest_px)
+
+    # -- start, failure -----------------------------------------------------------------------------------------
+
+    def _try_start(self, frame: Frame, imu: ImuSamples | None, missing: str) -> OdometryStep:
+        tracks = self.tracker.process(frame)
+        self.starter.add(self._view(tracks), imu)
+        self._views = [*self._views, tracks][-len(self.starter.views) :]
+        found = self.starter.find() if imu is not None else missing
+        if isinstance(found, Started):
+            found = self._started(found)
+        if isinstance(found, str):
+            status: Status = "lost" if self._left_at is not None else "initializing"
+            return OdometryStep(frame, status, self._nowhere(frame.t_ns), UNKNOWN_15, tracks, why=found)
+        state = found.newest
+        self._keyframe = LastKeyframe(frame.t_ns, state.T_world_body, tracks)
+        return OdometryStep(
+            frame, "tracking", state, found.covariance(), tracks, len(tracks), "the start", restarted=True
+        )
+
+    def _started(self, start: Started) -> Window | str:
+        """The window, begun with the images of the start, and solved; or why that failed."""
+        views = self._views[-len(start.states) :]
+        if start.how == "at rest":
+            chosen = np.array([len(views) - 1])
+        else:
+            chosen = np.unique(np.linspace(0, len(views) - 1, min(self.config.window.keyframes, len(views))).round())
+        chosen = chosen.astype(int)
+        moved = self._continued(start.states[int(chosen[0])])
+        states = [_moved(start.states[i], moved) for i in chosen]
+        sigma = StartSigma(
+            tilt_rad=max(3.0 * start.sigma_tilt, 0.02), velocity_m_s=max(3.0 * start.sigma_velocity, 0.02),
+            bias_gyro=max(3.0 * start.sigma_bias_gyro, 1e-3), bias_accel=self.config.start.bias_accel,
+        )  # fmt: skip
+        window = Window(self.rig, self.config.window, self.spec)
+        window.start(states[0], sigma, self._observations(views[int(chosen[0])]))
+        for i, state in zip(chosen[1:], states[1:], strict=True):
+            samples = self.stream.between(window.newest.t_ns, state.t_ns)
+            if isinstance(samples, str):
+                return samples
+            window.add_frame(state.t_ns, samples, self._observations(views[i]), keyframe=True, guess=state)
+        solution = window.solve(self.config.start_iterations)
+        failure = self._failure(solution, window.newest)
+        if failure:
+            return f"a start was found ({start.why}), but {failure}"
+        self.emit(window.newest.t_ns, "start", how=start.how, why=start.why)
+        self.window, self._blind_since = window, None
+        self.starter.reset()
+        self._views = []
+        return window
+
+    def _continued(self, first: NavState) -> SE3:
+        """T_new_old, a turn about z and a shift, that puts a state where the last window was left."""
+        if self._left_at is None:
+            return SE3.identity()
+        left = self._left_at.T_world_body
+        yaw = _yaw(left.R) - _yaw(first.T_world_body.R)
+        c, s = math.cos(yaw), math.sin(yaw)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return SE3(R, left.t - R @ first.T_world_body.t)
+
+    def _failure(self, solution: Solution, state: NavState) -> str:
+        """Why the window is believed no more; empty where it is."""
+        c = self.config
+        if not solution.ok:
+            return "the window's equations have no solution"
+        speed = float(np.linalg.norm(state.v_world))
+        if not speed < c.most_speed:
+            return f"the window believes in {speed:.1f} m/s"
+        gyro, accel = float(np.linalg.norm(state.bias_gyro)), float(np.linalg.norm(state.bias_accel))
+        if not (gyro < c.most_bias_gyro and accel < c.most_bias_accel):
+            return f"the window believes in biases of {gyro:.2f} rad/s and {accel:.2f} m/s^2"
+        return ""
+
+    def _blind(self, inliers: int, t_ns: int) -> str:
+        """Keeps count of frames with hardly any track; why the IMU alone is believed no more, empty where it is."""
+        if inliers >= self.config.few_tracks:
+            self._blind_since = None
+            return ""
+        if self._blind_since is None:
+            self._blind_since = t_ns
+        blind_s = (t_ns - self._blind_since) * 1e-9
+        return f"{inliers} tracks for {blind_s:.2f} s" if blind_s > self.config.blind_s else ""
+
+    def _fail(self, frame: Frame, why: str) -> OdometryStep:
+        """Leave the window; begin to look for a new start with this very frame."""
+        assert self.window is not None
+        self.emit(frame.t_ns, "failure", why=why)
+        self._left_at = self.window.keyframes()[-1]
+        self.window, self._keyframe, self._blind_since = None, None, None
+        self.restarts += 1
+        self.starter.reset()
+        self._views = []
+        self.tracker.reset()
+        tracks = self.tracker.process(frame)
+        self.starter.add(self._view(tracks), None)
+        self._views = [tracks]
+        return OdometryStep(frame, "lost", self._nowhere(frame.t_ns), UNKNOWN_15, tracks, why=why)
+
+    def _nowhere(self, t_ns: int) -> NavState:
+        T = self._left_at.T_world_body if self._left_at is not None else SE3.identity()
+        return NavState(t_ns, T, np.zeros(3), np.zeros(3), np.zeros(3))
+
+    def _view(self, tracks: Tracks) -> StartView:
+        right = np.flatnonzero(tracks.stereo)
+        n, none = len(tracks), np.zeros(len(right))
+        ray_right = self.rig.cameras[1].camera.unproject(tracks.px_right[right])[0] if len(right) else np.zeros((0, 3))
+        own = np.zeros(n) if len(right) else tracks.inv_depth
+        return StartView(
+            tracks.t_ns, np.concatenate([tracks.id, tracks.id[right]]),
+            np.concatenate([np.zeros(n, np.int32), np.ones(len(right), np.int32)]),
+            np.concatenate([tracks.ray, ray_right]), np.concatenate([own, none]),
+            np.concatenate([tracks.sigma_inv_depth, none]), self.tracker.flow.R_now_last,
+        )  # fmt: skip
+
+
+def _yaw(R: Array) -> float:
+    return math.atan2(R[1, 0], R[0, 0])
+
+
+def _moved(state: NavState, T: SE3) -> NavState:
+    return NavState(state.t_ns, T @ state.T_world_body, T.R @ state.v_world, state.bias_gyro, state.bias_accel)
