@@ -10,8 +10,9 @@ LAYERS = [
     ["__main__"],
     ["cli"],
     ["slam", "localizer", "doctor"],
+    ["inertial"],
     ["localization"],
-    ["mapping"],
+    ["mapping", "odometry"],
     ["estimation"],
     ["features", "tags", "lights", "imu"],
     ["report"],
@@ -27,7 +28,7 @@ LAYERS = [
 # Below the estimators in the list, yet not for them: they may not import these.
 OUTSIDE = {"io", "sim", "evaluation", "report"}
 ALLOWED = {("mapping", "io")}  # save that a map file holds its rig as the text of a rig.toml
-ESTIMATORS = {"localization", "mapping", "estimation", "features", "tags", "lights", "imu"}
+ESTIMATORS = {"inertial", "localization", "mapping", "odometry", "estimation", "features", "tags", "lights", "imu"}
 RANK = {name: len(LAYERS) - row for row, names in enumerate(LAYERS) for name in names}
 
 

@@ -16,6 +16,7 @@ from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3, carried_covariance
+from lodelight.inertial import InertialFront, Located
 from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording, woven
 from lodelight.localization.machine import LocalizationMachine
@@ -31,6 +32,7 @@ from lodelight.mapping.places import Places
 from lodelight.mapping.tags import MapTags, MapTagsConfig
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message, TagSighting
+from lodelight.odometry.inertial import InertialOdometry, OdometryConfig
 from lodelight.rig import Rig
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
@@ -59,6 +61,7 @@ class SlamConfig:
     gate: GateConfig = field(default_factory=GateConfig)
     lights: LightsConfig = field(default_factory=LightsConfig)
     tags: MapTagsConfig = field(default_factory=MapTagsConfig)
+    inertial: OdometryConfig = field(default_factory=OdometryConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,7 @@ class PathNode:
 
 
 class Slam:
-    """Simultaneous localization and mapping with RGB-D or stereo.
+    """Simultaneous localization and mapping with RGB-D or stereo, or with any camera and an IMU.
 
     `run` streams a recording; `feed` takes one message at a time, for live use; `close` waits for mapping to end.
     map : the map so far; a given one is continued
@@ -95,7 +98,8 @@ class Slam:
         self.config = config or SlamConfig()
         _check_sensors(self.config.sensors, known=map is not None)
         self.map = map if map is not None else Map(rig)
-        self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
+        visual, _, inertial = self.config.sensors.partition("-")
+        self.front_end = FrontEnd(rig, visual, self.config.orb)
         self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking, self.config.seed)
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
         self.lights = _light_anchor(self.map, self.config, anchors or Anchors(), self.emit)
@@ -106,6 +110,13 @@ class Slam:
         self.loops = LoopCloser(self.map, self.config.orb, places, self.config.loops, self.emit)
         known = anchors.tags if anchors is not None else ()
         self.tags = MapTags(self.map, self.config.orb, self.config.mapping.sigma_px, known, self.config.tags, self.emit)
+        self.inertial: InertialFront | None = None
+        if inertial:
+            odometry = InertialOdometry(rig, visual, self.config.inertial, self.emit, self.config.seed)
+            find = Relocalizer(self.map, self.config.orb, places).find
+            self.inertial = InertialFront(
+                odometry, self.map, self.front_end, self.tracker, self.mapper, find, self.emit
+            )  # fmt: skip
         self.live = live
         self.localization_only = False
         self.mapping = (ThreadedMapping if live else InlineMapping)(self._map)
@@ -131,6 +142,9 @@ class Slam:
             estimate = self.feed(message)
             if estimate is not None:
                 yield estimate
+        last = self.inertial.flush() if self.inertial is not None else None
+        if last is not None:
+            yield self._take(last)
         self.close()
 
     def close(self) -> None:
@@ -143,9 +157,15 @@ class Slam:
         self.tags.finish()
 
     def feed(self, message: Message) -> Estimate | None:
-        """One message; an estimate for every frame."""
-        if isinstance(message, LightFix) and self.lights:
-            self.lights.feed(message)
+        """One message; an estimate for every frame. With an IMU a frame waits for the sample behind it."""
+        if isinstance(message, LightFix):
+            if self.lights:
+                self.lights.feed(message)
+            return None
+        if self.inertial is not None:
+            self.inertial.localization_only = self.localization_only
+            located = self.inertial.feed(message)
+            return None if located is None else self._take(located)
         return self.step(message) if isinstance(message, Frame) else None
 
     def step(self, frame: Frame) -> Estimate:
@@ -197,7 +217,7 @@ class Slam:
             "loops": len(self.map.loops),
             "tags": int(np.count_nonzero(self.map.tags.placed)),
             "aligned": self.tags.aligned,
-            "relocalizations": self.relocalizations,
+            "relocalizations": self.relocalizations + (self.inertial.relocalizations if self.inertial else 0),
             "dropped": self.dropped,
             **({"gate": self.lights.gate.counts} if self.lights else {}),
         }
@@ -234,6 +254,16 @@ class Slam:
         if self.lights:
             self.lights.tracked(t_ns, 0, SE3.identity())
         return self._estimate(first, clock)
+
+    def _take(self, located: Located) -> Estimate:
+        """What the inertial half made of a frame: into the path, and its keyframe to mapping."""
+        estimate = located.estimate
+        if located.reference >= 0 and estimate.localized:
+            self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body))
+        if located.inserted >= 0:
+            self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.why, weight=1.0)
+            self.mapping.submit(located.inserted)
+        return estimate
 
     def _insert(self, tracked: Tracked, decision: Decision, tags: Sequence[TagSighting] = ()) -> None:
         """The quick half of mapping, which the next frame needs; the rest is the worker's."""
@@ -299,10 +329,10 @@ class Slam:
 
 
 def _check_sensors(sensors: str, known: bool) -> None:
-    if sensors.endswith("-inertial"):
-        raise ConfigError(f"{sensors}: this version does not use the IMU; choose {sensors.removesuffix('-inertial')}")
     if sensors == "mono" and not known:
-        raise ConfigError("mono alone gives a map no scale; choose rgbd or stereo, or give a map with --map")
+        raise ConfigError(
+            "mono alone gives a map no scale; choose rgbd, stereo or mono-inertial, or give a map with --map"
+        )
 
 
 def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSink) -> LightAnchor | None:
@@ -310,6 +340,8 @@ def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSin
     gated, tight = config.gate.use == "lights", config.lights.use == "tight"
     if gated and tight:
         raise ConfigError("the gate and tight lights would count the same light twice; choose --gate or --lights tight")
+    if (gated or tight) and config.sensors.endswith("-inertial"):
+        raise ConfigError(f"lights are not used together with the IMU yet; choose {config.sensors.partition('-')[0]}")
     if tight and (map.rig.lights is None or not anchors.lights):
         raise ConfigError("tight lights need a light camera in the rig and [[light]] entries in the anchors")
     return LightAnchor(map, config.gate, config.lights, anchors.lights, emit) if gated or tight else None

@@ -27,7 +27,7 @@ app = typer.Typer(add_completion=False)
 def run(
     source: Path = typer.Argument(..., help="A recording of any known format, or the number of a camera."),
     out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
-    sensors: str = typer.Option("", help="stereo or rgbd; default: the most the source has."),
+    sensors: str = typer.Option("", help="stereo, rgbd, or mono-, stereo-, rgbd-inertial; default: the most the source has."),
     rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
     anchors: Path = typer.Option(None, help="anchors.toml: what is surveyed of the building."),
     gate: str = typer.Option("none", help="lights: keyframes must agree with the pose by coded lights; or none."),
@@ -54,7 +54,8 @@ def run(
 
     recording = open_source(source, rig, parse_roles(topic))
     asked = [f"gate.use={gate}", f"lights.use={lights}", *settings]
-    config = with_settings(SlamConfig(sensors=sensors or _visual(recording), seed=seed), asked)
+    most = recording.rig.sensors if gate == "none" and lights == "off" else _visual(recording)
+    config = with_settings(SlamConfig(sensors=sensors or most, seed=seed), asked)
     known = load_map(map_file) if map_file else None
     surveyed = read_anchors(anchors) if anchors else None
     fixes: Iterable[LightFix] = ()
@@ -138,7 +139,7 @@ def slam_to_folder(
 
 
 def _visual(recording: Recording) -> str:
-    """The most a recording has of what this version can use."""
+    """The most a recording has without its IMU, with which lights are not used yet."""
     return recording.rig.sensors.removesuffix("-inertial")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,6 +60,7 @@ class LocalMapper:
         self.config = config
         self.camera = map.rig.cameras[0].camera
         self.T_body_cam = map.rig.cameras[0].T_body_cam
+        self.hold_poses = False  # keyframes stay where they were put; only points are adjusted
         self._young: list[tuple[int, Ints]] = []  # keyframe and the points it made, until they have proved themselves
 
     # -- the two halves -----------------------------------------------------------------------------------------
@@ -166,7 +167,11 @@ class LocalMapper:
         with map.lock:
             neighbours, _ = map.covisible(keyframe, self.config.min_shared)
         window = np.append(neighbours[: self.config.window - 1], keyframe).astype(np.int32)
-        adjust(map, window, self.orb, self.config.sigma_px, self.config.iterations, stop, newest=keyframe)
+        newest = None if self.hold_poses else keyframe
+        adjust(
+            map, window, self.orb, self.config.sigma_px, self.config.iterations, stop, newest=newest,
+            hold_poses=self.hold_poses,
+        )  # fmt: skip
 
     def _cull_keyframes(self, keyframe: int) -> None:
         map, kf = self.map, self.map.keyframes
@@ -233,14 +238,17 @@ def adjust(
     iterations: int,
     stop: Callable[[], bool] | None,
     newest: int | None = None,
+    hold_poses: bool = False,
 ) -> None:
     """Bundle adjustment of `window` keyframes and what they see; observations that do not fit are unlinked.
 
-    newest : keyframe whose covariance is found as well
+    newest : keyframe whose covariance is found as well; hold_poses : only points are adjusted
     """
     with map.lock:
         problem, keyframes, points, rows = bundle_of(map, window, orb, sigma_px)
         tied = with_tag_corners(map, problem, keyframes, window)
+        if hold_poses:
+            tied = replace(tied, fixed=np.ones(len(tied.fixed), bool))
     wanted = [] if newest is None else [int(np.searchsorted(keyframes, newest))]
     result = bundle_adjust(tied, iterations=iterations, stop=stop, covariance_of=wanted)
     with map.lock:

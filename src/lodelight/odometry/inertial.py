@@ -19,6 +19,7 @@ from lodelight.imu.initialization import StartConfig, Started, Starter, StartVie
 from lodelight.imu.preintegration import NavState
 from lodelight.imu.samples import ImuSamples
 from lodelight.imu.stream import ImuStream
+from lodelight.imu.vibration import Vibration
 from lodelight.messages import Frame, Imu, Status
 from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
 from lodelight.rig import Rig
@@ -34,6 +35,7 @@ class OdometryConfig:
     blind_s : without them for so long, and the IMU alone is believed no more
     most_speed m/s, most_bias_gyro rad/s, most_bias_accel m/s^2 : a window that believes more has failed
     start_iterations : of the first solution; sigma_px : noise of a track in the window
+    vibration : share of the accelerometer's fast changes that counts as white noise (imu/vibration.py)
     """
 
     few_tracks: int = 15
@@ -43,6 +45,7 @@ class OdometryConfig:
     most_bias_accel: float = 2.0
     start_iterations: int = 10
     sigma_px: float = 1.0
+    vibration: float = 0.4
     klt: KltConfig = field(default_factory=KltConfig)
     start: StartConfig = field(default_factory=StartConfig)
     keyframes: KeyframeRule = field(default_factory=KeyframeRule)
@@ -81,6 +84,7 @@ class InertialOdometry:
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
         self.tracker = KltTracker(rig, sensors, self.config.klt, seed)
         self.stream = ImuStream(rig.imu, self.emit)
+        self.vibration = Vibration(rig.imu, self.config.vibration)
         self.camera = rig.cameras[0].camera
         self.R_body_cam = rig.cameras[0].T_body_cam.R
         self.starter = Starter(
@@ -156,7 +160,12 @@ class InertialOdometry:
         if self._last_ns is None:
             return None, "the first frame"
         found = self.stream.between(self._last_ns, t_ns)
-        return (None, found) if isinstance(found, str) else (found, "")
+        if isinstance(found, str):
+            return None, found
+        self.spec = self.vibration.add(found)
+        if self.window is not None:
+            self.window.spec = self.spec
+        return found, ""
 
     def _observations(self, tracks: Tracks) -> Observations:
         right = np.flatnonzero(tracks.stereo)

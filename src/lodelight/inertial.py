@@ -1,0 +1,212 @@
+"""The inertial half of the SLAM system: odometry in front, the map behind it.
+
+The odometry's frame is `map`: smooth. The map's is `world`: corrected by loops and by what was known before. Between
+them lies T_world_map, a turn about the vertical and a shift; what a robot drives by is smooth, what it plans with is
+right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lodelight.compiled import Stopwatch
+from lodelight.estimation.window import Landmarks
+from lodelight.features.features import Features
+from lodelight.features.frontend import FrontEnd
+from lodelight.features.klt import Tracks
+from lodelight.features.matching import FeatureIndex
+from lodelight.geometry.se3 import SE3
+from lodelight.localization.machine import Finder
+from lodelight.localization.tracker import Tracked, Tracker
+from lodelight.mapping.local import LocalMapper
+from lodelight.mapping.map import Map
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Message
+from lodelight.odometry.inertial import InertialOdometry, OdometryStep
+from lodelight.types import Array, Bools
+
+EventSink = Callable[..., None]
+NEAR_TRACK_PX = 1.5  # a corner so near a track is the same point
+DEPTH_SIGMA = 0.02  # least relative deviation of a depth that the window gives a corner
+SEARCH = 2.0  # window in which map points are looked for around the odometry's pose, of a corner's own scale
+MIN_MATCHES = 20  # of map points, below which they do not tell a keyframe's place in the map
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """One frame: its estimate, and where it hangs: reference is a keyframe of the map, -1 where there is none.
+
+    inserted : the keyframe that this frame became, -1 where it did not; why : the reason
+    """
+
+    estimate: Estimate
+    reference: int
+    T_reference_body: SE3
+    inserted: int = -1
+    why: str = ""
+
+
+class InertialFront:
+    """Drives the odometry, and puts its keyframes into the map."""
+
+    def __init__(
+        self, odometry: InertialOdometry, map: Map, front_end: FrontEnd, tracker: Tracker, mapper: LocalMapper,
+        find: Finder, emit: EventSink,
+    ) -> None:  # fmt: skip
+        self.odometry = odometry
+        self.map = map
+        self.front_end = front_end
+        self.tracker = tracker
+        self.mapper = mapper
+        self.find = find
+        self.emit = emit
+        self.localization_only = False
+        self.relocalizations = 0
+        self._known = len(map.keyframes) > 0  # a map that the camera must first be found in
+        self._reference = -1
+        self._T_map_reference = SE3.identity()
+        self._in_window: dict[int, int] = {}  # keyframes of the map by their stamps
+        mapper.hold_poses = True  # the window has placed them, with the IMU
+
+    def feed(self, message: Message) -> Located | None:
+        """One message; where it completes a frame, that frame."""
+        clock = Stopwatch()
+        step = self.odometry.feed_frame(message) if isinstance(message, Frame) else self.odometry.feed_imu(message)
+        return None if step is None else self._located(step, clock)
+
+    def flush(self) -> Located | None:
+        """The last frame, which may still wait for a sample."""
+        clock = Stopwatch()
+        step = self.odometry.flush()
+        return None if step is None else self._located(step, clock)
+
+    @property
+    def T_world_map(self) -> SE3:
+        """Where the smooth frame lies in the corrected one, as the map stands now."""
+        if self._reference < 0:
+            return SE3.identity()
+        return level(self.map.pose(self._reference) @ self._T_map_reference.inverse(), self._T_map_reference)
+
+    # -- parts --------------------------------------------------------------------------------------------------
+
+    def _located(self, step: OdometryStep, clock: Stopwatch) -> Located:
+        t_ns = step.frame.t_ns
+        if step.status not in ("tracking", "degraded"):
+            return self._nowhere(step, clock)
+        inserted = -1
+        with self.map.lock:
+            self._settle_departed()
+            if step.keyframe:
+                if self._known and self._reference < 0 and not self._found(step):
+                    return self._nowhere(step, clock, "not found in the map yet")
+                inserted = self._insert(step)
+            elif self._reference < 0:
+                return self._nowhere(step, clock, "not found in the map yet")
+            T_world_map = self.T_world_map
+            T_world_body = T_world_map @ step.state.T_world_body
+            T_reference_body = self._T_map_reference.inverse() @ step.state.T_world_body
+        covariance = step.covariance[:6, :6].copy()
+        turn = np.eye(6)
+        turn[3:, 3:] = T_world_map.R
+        details = {"track_ms": clock.ms(), **_biases(step)}
+        estimate = Estimate(
+            t_ns, step.status, T_world_body, turn @ covariance @ turn.T, step.why, step.inliers, details
+        )  # fmt: skip
+        return Located(estimate, self._reference, T_reference_body, inserted, step.keyframe)
+
+    def _nowhere(self, step: OdometryStep, clock: Stopwatch, why: str = "") -> Located:
+        T = self.T_world_map @ step.state.T_world_body
+        status = step.status if step.status in ("initializing", "lost") else "initializing"
+        details = {"track_ms": clock.ms()}
+        estimate = Estimate(step.frame.t_ns, status, T, LOST_COVARIANCE, why or step.why, 0, details)
+        return Located(estimate, -1, SE3.identity())
+
+    def _found(self, step: OdometryStep) -> bool:
+        """Look for a frame in the map that was given; sets where the odometry's frame lies in it."""
+        found = self.find(self.front_end.process(step.frame))
+        if isinstance(found, str):
+            return False
+        T_world_map = level(found.T_world_body @ step.state.T_world_body.inverse(), step.state.T_world_body)
+        match = np.flatnonzero(found.point >= 0)
+        observers = self.map.shared_counts(found.point[match])
+        self._reference = int(np.argmax(observers))
+        self._T_map_reference = T_world_map.inverse() @ self.map.pose(self._reference)
+        self.relocalizations += 1
+        self.emit(step.frame.t_ns, "relocalized", why=found.why)
+        return True
+
+    def _insert(self, step: OdometryStep) -> int:
+        """A keyframe of the window becomes one of the map."""
+        if self.localization_only:
+            return -1
+        T_world_body = self.T_world_map @ step.state.T_world_body
+        seen = self.front_end.process(step.frame)
+        window = self.odometry.window
+        assert window is not None
+        if not (seen.inv_depth > 0).any():
+            seen = with_landmark_depth(seen, step.tracks, window.landmarks(), self._T_map_cam(step))
+        nothing = np.full(len(seen), -1, np.int32)
+        tracked = Tracked(step.frame.t_ns, seen, T_world_body, step.covariance[:6, :6], nothing, max(self._reference, 0))
+        if self._reference >= 0:
+            index = FeatureIndex(seen, self.tracker.camera.width, self.tracker.camera.height)
+            matched = self.tracker.refine(step.frame.t_ns, seen, T_world_body, nothing, index, SEARCH)
+            if matched.n_inliers >= MIN_MATCHES:
+                tracked.point = matched.point
+        keyframe = self.mapper.insert(
+            step.frame.t_ns, T_world_body, seen, tracked.point, 1.0, self._reference, tracked.noise
+        )  # fmt: skip
+        self.map.keyframes.covariance[keyframe] = step.covariance[:6, :6]
+        tracked.point[:] = self.map.points_of(keyframe)
+        tracked.reference = keyframe
+        self.tracker.accept(tracked)
+        self._reference, self._T_map_reference = keyframe, step.state.T_world_body
+        self._in_window[step.frame.t_ns] = keyframe
+        return keyframe
+
+    def _T_map_cam(self, step: OdometryStep) -> SE3:
+        return step.state.T_world_body @ self.map.rig.cameras[0].T_body_cam
+
+    def _settle_departed(self) -> None:
+        """Keyframes that left the window stay where it saw them last."""
+        window = self.odometry.window
+        if window is None:
+            return
+        T_world_map = self.T_world_map
+        for gone in window.departed():
+            keyframe = self._in_window.pop(gone.t_ns, -1)
+            if keyframe >= 0 and keyframe != self._reference and self.map.keyframes.alive[keyframe]:
+                self.map.set_pose(keyframe, T_world_map @ gone.state.T_world_body)
+
+
+def level(T: SE3, T_inner: SE3) -> SE3:
+    """The turn about z and the shift nearest to T that take T_inner to where T takes it."""
+    yaw = math.atan2(T.R[1, 0] - T.R[0, 1], T.R[0, 0] + T.R[1, 1])
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return SE3(R, T @ T_inner.t - R @ T_inner.t)
+
+
+def with_landmark_depth(seen: Features, tracks: Tracks, landmarks: Landmarks, T_map_cam: SE3) -> Features:
+    """Corners that lie on a track of the window get the depth of its landmark."""
+    _, row, landmark = np.intersect1d(tracks.id, landmarks.track, assume_unique=True, return_indices=True)
+    z = (T_map_cam.inverse() @ landmarks.xyz[landmark])[:, 2]
+    relative = landmarks.sigma_inv_depth[landmark] / np.maximum(landmarks.inv_depth[landmark], 1e-6)
+    good: Bools = (z > 0.1) & (landmarks.seen[landmark] >= 3) & (relative < 0.2)
+    px, z, relative = tracks.px[row[good]], z[good], np.maximum(2.0 * relative[good], DEPTH_SIGMA)
+    inv_depth, sigma = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
+    if len(px):
+        away = np.linalg.norm(seen.px[:, None, :] - px[None, :, :], axis=2)
+        nearest = away.argmin(axis=1)
+        hit = np.flatnonzero(away[np.arange(len(seen)), nearest] < NEAR_TRACK_PX)
+        inv_depth[hit] = 1.0 / z[nearest[hit]]
+        sigma[hit] = relative[nearest[hit]] * inv_depth[hit]
+    return seen.with_depth(inv_depth, sigma)
+
+
+def _biases(step: OdometryStep) -> dict[str, float]:
+    names = [f"bias_{kind}_{axis}" for kind in ("gyro", "accel") for axis in "xyz"]
+    values: Array = np.concatenate([step.state.bias_gyro, step.state.bias_accel])
+    return dict(zip(names, values.tolist(), strict=True))
