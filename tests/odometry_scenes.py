@@ -139,7 +139,9 @@ class Points:
         self.tracks = None
 
 
-def messages(motion: Motion, spec: ImuSpec, seed: int, rate_hz: float = 20.0, turn_on: tuple[float, float] = (0.02, 0.05)) -> Iterator[Imu | Frame]:
+def messages(
+    motion: Motion, spec: ImuSpec, seed: int, rate_hz: float = 20.0, turn_on: tuple[float, float] = (0.02, 0.05)
+) -> Iterator[Imu | Frame]:
     """Samples and (empty) frames in the order of their stamps."""
     series = read_out(motion, spec, np.random.default_rng(seed), turn_on)
     step = round(spec.rate_hz / rate_hz)

@@ -149,7 +149,9 @@ class InertialFront:
         if not (seen.inv_depth > 0).any():
             seen = with_landmark_depth(seen, step.tracks, window.landmarks(), self._T_map_cam(step))
         nothing = np.full(len(seen), -1, np.int32)
-        tracked = Tracked(step.frame.t_ns, seen, T_world_body, step.covariance[:6, :6], nothing, max(self._reference, 0))
+        tracked = Tracked(
+            step.frame.t_ns, seen, T_world_body, step.covariance[:6, :6], nothing, max(self._reference, 0)
+        )
         if self._reference >= 0:
             index = FeatureIndex(seen, self.tracker.camera.width, self.tracker.camera.height)
             matched = self.tracker.refine(step.frame.t_ns, seen, T_world_body, nothing, index, SEARCH)

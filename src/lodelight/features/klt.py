@@ -177,7 +177,8 @@ class KltTracker:
         self, image: Bytes, t_ns: int, R_now_last: Array | None, sigma_rotation: float
     ) -> tuple[Tracks, ArrayF32]:
         old = self._tracks
-        assert old is not None and self._last is not None
+        assert old is not None
+        assert self._last is not None
         R = np.eye(3) if R_now_last is None else R_now_last
         turned, seen = self.camera.project(old.ray @ R.T)
         guess = np.where(seen[:, None], turned, old.px).astype(np.float32)
@@ -302,7 +303,7 @@ def best_corners(
     A corner counts if its score is above `quality` of a good one's, and above `floor`.
     """
     height, width = score.shape
-    columns, rows = int(math.ceil(width / cell)), int(math.ceil(height / cell))
+    columns, rows = math.ceil(width / cell), math.ceil(height / cell)
     taken = np.zeros((height, width), np.bool_)
     for k in range(len(px)):
         x, y = 0.5 * (px[k, 0] - 0.5), 0.5 * (px[k, 1] - 0.5)

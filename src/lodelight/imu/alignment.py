@@ -26,7 +26,7 @@ from lodelight.geometry.dense import inverse3, matmul, transposed
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp
 from lodelight.imu.preintegration import Preintegration
-from lodelight.types import Array, Bools, Ints
+from lodelight.types import Array, Ints
 
 GRAVITY_M_S2 = 9.81
 N = 11  # gravity's direction 2, velocity 3, gyro bias 3, accelerometer bias 3
@@ -196,7 +196,9 @@ class _Problem:
         R, p, _ = self._poses(at)
         tangent = _tangent(at.gravity)
         n = len(at.X)
-        out = _Linearized(np.zeros((N, N)), np.zeros(N), np.zeros((n, 6)), np.zeros((n, 3)), np.zeros((n, N, 3)), tangent)
+        out = _Linearized(
+            np.zeros((N, N)), np.zeros(N), np.zeros((n, 6)), np.zeros((n, 3)), np.zeros((n, N, 3)), tangent
+        )
         out.cost, out.inliers, out.used, out.chi2 = angle_equations(
             m.t_s, R, p, m.jacobian, self.R_cam, self.p_cam, rows.frame, rows.camera, rows.ray, rows.inv_depth,
             rows.sigma_inv_depth, rows.start, at.X, tangent * GRAVITY_M_S2, self.sigma_ray, damping,
@@ -239,7 +241,7 @@ class _Problem:
         rms = math.sqrt(by.chi2 / dof)
         covariance *= max(rms, 1.0) ** 2
         R, p, v = self._poses(at)
-        m, far = self.motions, int(np.argmax(np.linalg.norm(p, axis=1)))
+        _m, far = self.motions, int(np.argmax(np.linalg.norm(p, axis=1)))
         J_v, J_p = (self._sensitivity(k, by.tangent)[i] for k, i in ((len(p) - 1, 1), (far, 0)))
         path = float(np.linalg.norm(p[far]))
         along = p[far] / max(path, 1e-9)
@@ -471,7 +473,7 @@ def angle_equations(
     y, B, Jy, A = np.empty(3), np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
     Jp, Jt = np.empty((3, 3)), np.empty((3, 3))
     for m in range(len(start) - 1):
-        if not X[m, 0] == X[m, 0] or start[m + 1] - start[m] < 2:
+        if X[m, 0] != X[m, 0] or start[m + 1] - start[m] < 2:
             continue
         V = np.zeros((3, 3))
         for row in range(start[m], start[m + 1]):
@@ -582,7 +584,7 @@ def step_landmarks(X: Array, V_inverse: Array, gradient: Array, W: Array, d: Arr
     """Move X (M, 3) by what is left of each landmark's equations after the step d (11,)."""
     r = np.empty(3)
     for m in range(len(X)):
-        if not X[m, 0] == X[m, 0]:
+        if X[m, 0] != X[m, 0]:
             continue
         for i in range(3):
             r[i] = gradient[m, i]

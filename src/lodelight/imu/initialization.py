@@ -31,7 +31,8 @@ GRAVITY_M_S2 = 9.81
 
 @dataclass(frozen=True)
 class StartConfig:
-    """rest_s : standing still for so long starts; longest_s : of images that are kept; shortest_s : in motion
+    """rest_s : standing still for so long starts; longest_s : of images that are kept
+    shortest_s : in motion, with one camera; shortest_metric_s : with two, or depth
     rest_px, rest_gyro, rest_accel : standing still moves the image by no more (median), and deviates by no more,
         rad/s and m/s^2
     min_tracks : landmarks seen from the first to the last image
@@ -43,7 +44,8 @@ class StartConfig:
     """
 
     rest_s: float = 0.4
-    shortest_s: float = 0.7
+    shortest_s: float = 1.4
+    shortest_metric_s: float = 0.7
     longest_s: float = 1.9
     rest_px: float = 0.5
     rest_gyro: float = 0.02
@@ -116,7 +118,7 @@ class Starter:
         self.views, self.imu = [], []
 
     def add(self, view: StartView, imu: ImuSamples | None) -> None:
-        """The next image, and the samples from the one before; None where there are none, and all before is forgotten."""
+        """The next image, and the samples since the one before; without them (None) all before is forgotten."""
         if imu is None:
             self.reset()
         elif self.views:
@@ -132,16 +134,20 @@ class Starter:
     def find(self) -> Started | str:
         """The start, or what is missing. Raises SourceError where the IMU's units are wrong."""
         c = self.config
+        shortest_s = c.shortest_metric_s if self.metric else c.shortest_s
         if len(self.views) < 3 or self._span_s < c.rest_s:
-            return f"{self._span_s:.2f} s of images and IMU so far; {c.rest_s:.2f} s are needed standing still, {c.shortest_s:.2f} s in motion"
+            return (
+                f"{self._span_s:.2f} s of images and IMU so far; {c.rest_s:.2f} s are needed standing still, "
+                f"{shortest_s:.2f} s in motion"
+            )
         fault = accelerometer_fault(np.vstack([s.accel for s in self.imu])) or self._gyro_fault()
         if fault:
             raise SourceError(f"{fault} (or correct the recording's IMU)")
         at_rest = self._at_rest()
         if isinstance(at_rest, Started):
             return at_rest
-        if self._span_s < c.shortest_s:
-            return f"{at_rest}; in motion {c.shortest_s:.2f} s are needed, there are {self._span_s:.2f}"
+        if self._span_s < shortest_s:
+            return f"{at_rest}; in motion {shortest_s:.2f} s are needed, there are {self._span_s:.2f}"
         in_motion = self._in_motion()
         return in_motion if isinstance(in_motion, Started) else f"{at_rest}; {in_motion}"
 
@@ -156,7 +162,11 @@ class Starter:
         shakes = [
             (moved_px, c.rest_px, "the image moves by {:.1f} px, at rest {:.1f}"),
             (float(gyro.std(axis=0).max()), c.rest_gyro, "the gyroscope deviates by {:.3f} rad/s, at rest {:.3f}"),
-            (float(accel.std(axis=0).max()), c.rest_accel, "the accelerometer deviates by {:.2f} m/s^2, at rest {:.2f}"),
+            (
+                float(accel.std(axis=0).max()),
+                c.rest_accel,
+                "the accelerometer deviates by {:.2f} m/s^2, at rest {:.2f}",
+            ),
         ]
         for value, most, text in shakes:
             if value > most:
@@ -186,7 +196,7 @@ class Starter:
 
     def _in_motion(self) -> Started | str:
         c = self.config
-        track_a, ray_a = self.views[0].first_camera()
+        track_a, _ray_a = self.views[0].first_camera()
         track_b, _ = self.views[-1].first_camera()
         lasting = len(np.intersect1d(track_a, track_b))
         rows = self._rows()
@@ -258,11 +268,9 @@ class Starter:
 
     def _gyro_fault(self) -> str:
         R = self.T_body_cam[0].R
-        none = np.zeros(3)
         seen = np.stack([so3_log(np.ascontiguousarray(R @ v.R_now_last.T @ R.T)) for v in self.views[1:]])
         dt_s = [(s.t_ns[-1] - s.t_ns[0]) * 1e-9 for s in self.imu]
         turned = np.stack([np.trapezoid(s.gyro, (s.t_ns - s.t_ns[0]) * 1e-9, axis=0) for s in self.imu])
-        del none
         return gyroscope_fault(turned, seen, float(np.sum(dt_s)))
 
     def _parallax_deg(self, motions: list[Preintegration]) -> float:
@@ -282,13 +290,17 @@ class Starter:
         c = self.config
         if found.behind > 0.5:
             raise SourceError(
-                f"{found.behind:.0%} of the landmarks come to lie behind the camera: the accelerometer's sign is turned "
+                f"{found.behind:.0%} of the landmarks lie behind the camera: the accelerometer's sign is turned "
                 "(at rest it must read +9.81 m/s^2 upwards); negate it"
             )
         if found.inliers < 0.6 * found.n:
             return f"{found.inliers} of {found.n} sightings agree with the IMU; check the camera's pose and the clocks"
         shares = [
-            (0.0 if self.metric else found.sigma_scale, c.max_scale, "scale known to {:.0%}, {:.0%} are needed: accelerate"),
+            (
+                0.0 if self.metric else found.sigma_scale,
+                c.max_scale,
+                "scale known to {:.0%}, {:.0%} are needed: accelerate",
+            ),
             (math.degrees(found.sigma_tilt), c.max_tilt_deg, "gravity known to {:.1f} deg, {:.1f} are needed: turn"),
             (found.sigma_velocity, c.max_velocity, "velocity known to {:.2f} m/s, {:.2f} are needed"),
         ]
@@ -312,7 +324,7 @@ class Starter:
 
 
 def upright(down: Array) -> Array:
-    """R_world_body (3, 3) with `down` (3,), as the body sees it, along -z, and the body's x axis ahead of the world's."""
+    """R_world_body (3, 3) with `down` (3,), in the body's axes, along -z, and the body's x axis over the world's."""
     z = -down / np.linalg.norm(down)
     forward = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 0.0, -1.0 if z[0] > 0 else 1.0])
     x = forward - (forward @ z) * z

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable
@@ -50,7 +51,9 @@ class ImuStream:
         if self._t and t > self._t[-1]:
             step = t - self._t[-1]
             if self._period_ns and step > GAP_PERIODS * self._period_ns:
-                self._fault(t, "gap", f"no samples for {step / 1e6:.0f} ms, where {self._period_ns / 1e6:.1f} ms are usual")
+                self._fault(
+                    t, "gap", f"no samples for {step / 1e6:.0f} ms, where {self._period_ns / 1e6:.1f} ms are usual"
+                )
             at = len(self._t)
         else:
             at = bisect_left(self._t, t)
@@ -59,7 +62,9 @@ class ImuStream:
             if t <= self._done_ns:
                 return self._fault(t, "late", f"a sample came {(self._done_ns - t) / 1e6:.0f} ms late; it is left out")
             if self._t:
-                self._fault(t, "out of order", f"a sample is {(self._t[-1] - t) / 1e6:.1f} ms out of order; it is put in place")
+                self._fault(
+                    t, "out of order", f"a sample is {(self._t[-1] - t) / 1e6:.1f} ms out of order; it is put in place"
+                )
         self._t.insert(at, t)
         self._gyro.insert(at, np.asarray(sample.gyro, np.float64))
         self._accel.insert(at, np.asarray(sample.accel, np.float64))
@@ -97,7 +102,7 @@ class ImuStream:
             return f"no IMU for this frame: its samples {side} it, by {away / 1e9:.3g} s{clock}"
         low, high = bisect_left(self._t, start_ns), bisect_left(self._t, end_ns)
         inner = [start_ns, *self._t[low:high], end_ns]
-        hole = max(b - a for a, b in zip(inner, inner[1:], strict=False))
+        hole = max(b - a for a, b in itertools.pairwise(inner))
         if hole > BROKEN_NS:
             return f"no IMU for {hole / 1e9:.2f} s before this frame"
         return ""

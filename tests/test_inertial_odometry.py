@@ -1,0 +1,128 @@
+"""Odometry on simulated tracks and samples: it starts, stays close to the truth, says what it lacks, and goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lodelight.errors import SourceError
+from lodelight.evaluation.compare import Comparison, compare
+from lodelight.imu.initialization import upright
+from lodelight.messages import Frame, Imu
+from lodelight.odometry.inertial import InertialOdometry, OdometryStep
+from lodelight.sim.motion import Motion
+from lodelight.trajectory import Trajectory
+from odometry_scenes import START_NS, Points, flight, messages, rig
+
+
+def run(motion: Motion, cameras: int, seed: int = 0, change=None) -> tuple[list[OdometryStep], InertialOdometry, list]:
+    """change : called with every message; returns what is fed instead, None = nothing"""
+    world, events = rig(cameras), []
+    odometry = InertialOdometry(
+        world, "stereo" if cameras > 1 else "mono", on_event=lambda t, kind, **f: events.append((t, kind, f))
+    )
+    odometry.tracker = Points(motion, world, seed)
+    steps = []
+    for message in messages(motion, world.imu, seed):
+        message = change(message) if change else message
+        if message is None:
+            continue
+        step = odometry.feed_frame(message) if isinstance(message, Frame) else odometry.feed_imu(message)
+        if step is not None:
+            steps.append(step)
+    return steps, odometry, events
+
+
+def judged(steps: list[OdometryStep], motion: Motion) -> Comparison:
+    live = [s for s in steps if s.status in ("tracking", "degraded")]
+    path = Trajectory.from_poses([s.frame.t_ns for s in live], [s.state.T_world_body for s in live])
+    stamps = np.array([s.frame.t_ns for s in live])
+    return compare(
+        path, motion.trajectory(200.0), "yaw", 0.01, (stamps, np.stack([s.covariance[:6, :6] for s in live]))
+    )
+
+
+def seconds(step: OdometryStep) -> float:
+    return (step.frame.t_ns - START_NS) * 1e-9
+
+
+def test_one_camera_starts_in_flight_and_stays_within_centimetres():
+    """Half a pixel of noise, EuRoC's IMU: 1 cm over 10 m of path; the bound is three times that."""
+    motion = flight(6.0, seed=0)
+    steps, odometry, events = run(motion, 1)
+    started = next(s for s in steps if s.status == "tracking")
+    assert seconds(started) <= 2.0
+    assert [kind for _, kind, _ in events].count("start") == 1
+    assert odometry.restarts == 0
+    found = judged(steps, motion)
+    assert found.ate.rmse_m < 0.03
+    assert found.ate.rotation_deg < 1.0
+    assert found.nees is not None
+    assert found.nees.pose < 6 * 1.5
+    before = steps[: steps.index(started)]
+    assert all(s.status == "initializing" and s.why for s in before)
+    assert "needed" in before[3].why
+
+
+def test_standing_still_starts_within_half_a_second():
+    motion = flight(2.0, seed=1, rest_s=1.0)
+    steps, _, events = run(motion, 1)
+    started = next(s for s in steps if s.status == "tracking")
+    assert seconds(started) <= 0.5
+    assert next(f["how"] for _, kind, f in events if kind == "start") == "at rest"
+    assert np.linalg.norm(started.state.v_world) < 0.02
+    up = started.state.T_world_body.R.T @ [0.0, 0.0, 1.0]
+    true_up = motion.at_ns(np.array([started.frame.t_ns])).R_world_body[0].T @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arccos(up @ true_up)) < 1.5  # an accelerometer bias of 0.1 m/s^2 tilts by 0.6 deg
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda m: dataclasses.replace(m, accel=m.accel / 9.80665), "in g"),
+        (lambda m: dataclasses.replace(m, gyro=np.degrees(m.gyro)), "deg/s"),
+        (lambda m: dataclasses.replace(m, accel=-m.accel), "sign is turned"),
+    ],
+)
+def test_an_imu_of_another_unit_or_sign_is_named(change, named):
+    motion = flight(2.5, seed=2)
+    with pytest.raises(SourceError, match=named):
+        run(motion, 1, change=lambda m: change(m) if isinstance(m, Imu) else m)
+
+
+def test_without_imu_it_says_so_and_after_a_hole_it_starts_again_where_it_was():
+    motion = flight(5.0, seed=3)
+    hole = (START_NS + 2_000_000_000, START_NS + 2_800_000_000)
+    steps, odometry, events = run(
+        motion, 1, change=lambda m: None if isinstance(m, Imu) and hole[0] < m.t_ns < hole[1] else m
+    )
+    assert odometry.restarts == 1
+    assert [k for _, k, _ in events].count("failure") == 1
+    lost = [s for s in steps if s.status == "lost"]
+    assert lost
+    assert "IMU" in lost[0].why
+    again = next(s for s in steps if s.restarted and s.frame.t_ns > hole[1])
+    assert seconds(again) < 4.8
+
+
+def test_stamps_of_another_clock_are_told_in_every_frame():
+    motion = flight(1.0, seed=4)
+    steps, odometry, _ = run(
+        motion, 1, change=lambda m: dataclasses.replace(m, t_ns=m.t_ns + 10**13) if isinstance(m, Imu) else m
+    )
+    last = odometry.flush()
+    steps = [*steps, last] if last else steps
+    assert steps
+    assert all(s.status == "initializing" for s in steps)
+    assert "another clock" in steps[-1].why
+
+
+def test_the_upright_frame_has_gravity_down():
+    rng = np.random.default_rng(0)
+    for down in rng.standard_normal((20, 3)):
+        R = upright(down)
+        assert np.allclose(R @ R.T, np.eye(3))
+        assert np.linalg.det(R) > 0
+        assert np.allclose(R @ down, [0.0, 0.0, -np.linalg.norm(down)])
