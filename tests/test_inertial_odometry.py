@@ -17,13 +17,15 @@ from lodelight.trajectory import Trajectory
 from odometry_scenes import START_NS, Points, flight, messages, rig
 
 
-def run(motion: Motion, cameras: int, seed: int = 0, change=None) -> tuple[list[OdometryStep], InertialOdometry, list]:
+def run(
+    motion: Motion, cameras: int, seed: int = 0, change=None, sigma_px: float = 0.5
+) -> tuple[list[OdometryStep], InertialOdometry, list]:
     """change : called with every message; returns what is fed instead, None = nothing"""
     world, events = rig(cameras), []
     odometry = InertialOdometry(
         world, "stereo" if cameras > 1 else "mono", on_event=lambda t, kind, **f: events.append((t, kind, f))
     )
-    odometry.tracker = Points(motion, world, seed)
+    odometry.tracker = Points(motion, world, seed, sigma_px)
     steps = []
     for message in messages(motion, world.imu, seed):
         message = change(message) if change else message
@@ -68,7 +70,7 @@ def test_one_camera_starts_in_flight_and_stays_within_centimetres():
 
 def test_standing_still_starts_within_half_a_second():
     motion = flight(2.0, seed=1, rest_s=1.0)
-    steps, _, events = run(motion, 1)
+    steps, _, events = run(motion, 1, sigma_px=0.2)
     started = next(s for s in steps if s.status == "tracking")
     assert seconds(started) <= 0.5
     assert next(f["how"] for _, kind, f in events if kind == "start") == "at rest"

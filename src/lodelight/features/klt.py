@@ -184,7 +184,7 @@ class KltTracker:
         guess = np.where(seen[:, None], turned, old.px).astype(np.float32)
         px, found = self._flow(self._last, image, old.px, guess + self._drift)
         keep = np.flatnonzero(found & self.camera.inside(px.astype(np.float64), 2.0))
-        ray, real = self.camera.unproject(px[keep])
+        ray, real = self.camera.unproject(px[keep].astype(np.float64))
         keep, ray = keep[real], ray[real]
         sigma = self.config.sigma_px / self.camera.focal_px
         if R_now_last is None:
@@ -244,7 +244,7 @@ class KltTracker:
         start = np.where(seen[:, None], guess, tracks.px).astype(np.float32)
         px, found = self._flow(left, self._equalized(right), tracks.px, start)
         found &= self.right.camera.inside(px.astype(np.float64), 1.0)
-        ray, real = self.right.camera.unproject(px)
+        ray, real = self.right.camera.unproject(px.astype(np.float64))
         rows = np.flatnonzero(found & real)
         sigma = np.full(len(rows), STEREO_BOUND * self.config.sigma_px / self.camera.focal_px)
         xyz, good = triangulate_pairs(
@@ -282,7 +282,7 @@ def _check_size(image: Bytes, spec: CameraSpec) -> None:
 
 def _with_new(old: Tracks, fresh: ArrayF32, camera: Camera, first_id: int) -> Tracks:
     """The tracks and, behind them, those that begin at pixels (M, 2) where the lens has a ray."""
-    ray, real = camera.unproject(fresh)
+    ray, real = camera.unproject(fresh.astype(np.float64))
     fresh, ray = fresh[real], ray[real]
     n = len(fresh)
     return Tracks(

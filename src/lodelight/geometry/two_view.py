@@ -135,7 +135,7 @@ def _angle(t: Array, g: Array, normal: Array) -> float:
     length = math.sqrt(x * x + y * y + z * z)
     if length < NEAR_BASELINE:
         return math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    return (t[0] * normal[0] + t[1] * normal[1] + t[2] * normal[2]) / length
+    return float((t[0] * normal[0] + t[1] * normal[1] + t[2] * normal[2]) / length)
 
 
 @kernel

@@ -31,6 +31,8 @@ from lodelight.types import Array, Ints
 GRAVITY_M_S2 = 9.81
 N = 11  # gravity's direction 2, velocity 3, gyro bias 3, accelerometer bias 3
 LINEAR_REPETITIONS = 4
+MOST_BEHIND = 0.5  # share of the landmarks
+BEHIND = "most landmarks would lie behind the camera"
 HUBER = 1.5  # of a ray's angle, in units of its noise
 
 
@@ -135,6 +137,8 @@ def align(
     started = problem.linear()
     if isinstance(started, str):
         return started
+    if started[2] > MOST_BEHIND:
+        return BEHIND
     return problem.refined(*started, iterations)
 
 
@@ -214,7 +218,7 @@ class _Problem:
     def _stepped(self, at: _Guess, by: _Linearized) -> _Guess:
         H = by.H + np.diag(1e-9 * np.diag(by.H) + 1e-12)
         try:
-            d = np.linalg.solve(H, by.b)
+            d: Array = np.linalg.solve(H, by.b)
         except np.linalg.LinAlgError:
             d = np.zeros(N)
         gravity = at.gravity + GRAVITY_M_S2 * by.tangent @ d[:2]
@@ -234,7 +238,7 @@ class _Problem:
 
     def _result(self, at: _Guess, by: _Linearized, behind: float) -> Alignment | str:
         try:
-            covariance = np.linalg.inv(by.H)
+            covariance: Array = np.linalg.inv(by.H)
         except np.linalg.LinAlgError:
             return "the images do not determine the motion"
         dof = max(by.inliers * 2 - N, 1)

@@ -18,7 +18,7 @@ from lodelight.errors import SourceError
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_log
 from lodelight.geometry.two_view import fit_two_view
-from lodelight.imu.alignment import Alignment, Motions, Rows, align
+from lodelight.imu.alignment import BEHIND, Alignment, Motions, Rows, align
 from lodelight.imu.gyro_bias import gyro_bias
 from lodelight.imu.preintegration import NavState, Preintegration, preintegrate
 from lodelight.imu.samples import ImuSamples
@@ -47,7 +47,7 @@ class StartConfig:
     shortest_s: float = 1.4
     shortest_metric_s: float = 0.7
     longest_s: float = 1.9
-    rest_px: float = 0.5
+    rest_px: float = 0.75
     rest_gyro: float = 0.02
     rest_accel: float = 0.25
     min_tracks: int = 25
@@ -142,7 +142,7 @@ class Starter:
             )
         fault = accelerometer_fault(np.vstack([s.accel for s in self.imu])) or self._gyro_fault()
         if fault:
-            raise SourceError(f"{fault} (or correct the recording's IMU)")
+            raise SourceError(fault)
         at_rest = self._at_rest()
         if isinstance(at_rest, Started):
             return at_rest
@@ -210,6 +210,8 @@ class Starter:
                 return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
         sigma_ray = c.sigma_px / self.focal_px
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray, (0.2 * c.bias_gyro, c.bias_accel))
+        if found == BEHIND:
+            self._refuse_turned_sign(rows, sigma_ray, bias)
         if isinstance(found, str):
             return found
         missing = self._missing(found)
@@ -288,11 +290,6 @@ class Starter:
 
     def _missing(self, found: Alignment) -> str:
         c = self.config
-        if found.behind > 0.5:
-            raise SourceError(
-                f"{found.behind:.0%} of the landmarks lie behind the camera: the accelerometer's sign is turned "
-                "(at rest it must read +9.81 m/s^2 upwards); negate it"
-            )
         if found.inliers < 0.6 * found.n:
             return f"{found.inliers} of {found.n} sightings agree with the IMU; check the camera's pose and the clocks"
         shares = [
@@ -305,6 +302,19 @@ class Starter:
             (found.sigma_velocity, c.max_velocity, "velocity known to {:.2f} m/s, {:.2f} are needed"),
         ]
         return next((text.format(value, most) for value, most, text in shares if not value < most), "")
+
+    def _refuse_turned_sign(self, rows: Rows, sigma_ray: float, bias: Array) -> None:
+        """Raise SourceError if everything fits with the accelerometer's sign turned."""
+        imu = self.imu
+        self.imu = [ImuSamples(s.t_ns, s.gyro, -s.accel) for s in imu]
+        motions = self._motions(bias)
+        self.imu = imu
+        found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray)
+        if isinstance(found, Alignment) and found.inliers > 0.8 * found.n and found.behind < 0.2:
+            raise SourceError(
+                "the accelerometer's sign is turned: images and IMU agree if it is negated (at rest it must read "
+                "+9.81 m/s^2 upwards); negate it in the recording"
+            )
 
     def _started(self, found: Alignment) -> Started:
         R0 = upright(found.gravity)

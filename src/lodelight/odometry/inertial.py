@@ -45,7 +45,7 @@ class OdometryConfig:
     most_bias_accel: float = 2.0
     start_iterations: int = 10
     sigma_px: float = 1.0
-    vibration: float = 0.4
+    vibration: float = 0.3
     klt: KltConfig = field(default_factory=KltConfig)
     start: StartConfig = field(default_factory=StartConfig)
     keyframes: KeyframeRule = field(default_factory=KeyframeRule)
@@ -201,9 +201,8 @@ class InertialOdometry:
         tracks = self.tracker.process(frame)
         self.starter.add(self._view(tracks), imu)
         self._views = [*self._views, tracks][-len(self.starter.views) :]
-        found = self.starter.find() if imu is not None else missing
-        if isinstance(found, Started):
-            found = self._started(found)
+        start = self.starter.find() if imu is not None else missing
+        found = self._started(start) if isinstance(start, Started) else start
         if isinstance(found, str):
             status: Status = "lost" if self._left_at is not None else "initializing"
             return OdometryStep(frame, status, self._nowhere(frame.t_ns), UNKNOWN_15, tracks, why=found)
@@ -216,8 +215,9 @@ class InertialOdometry:
     def _started(self, start: Started) -> Window | str:
         """The window, begun with the images of the start, and solved; or why that failed."""
         views = self._views[-len(start.states) :]
-        if start.how == "at rest":
-            chosen = np.array([len(views) - 1])
+        still = start.how == "at rest"
+        if still:
+            chosen = np.array([0, len(views) - 1])
         else:
             chosen = np.unique(np.linspace(0, len(views) - 1, min(self.config.window.keyframes, len(views))).round())
         chosen = chosen.astype(int)
@@ -233,7 +233,9 @@ class InertialOdometry:
             samples = self.stream.between(window.newest.t_ns, state.t_ns)
             if isinstance(samples, str):
                 return samples
-            window.add_frame(state.t_ns, samples, self._observations(views[i]), keyframe=True, guess=state)
+            window.add_frame(
+                state.t_ns, samples, self._observations(views[i]), keyframe=True, standstill=still, guess=state
+            )
         solution = window.solve(self.config.start_iterations)
         failure = self._failure(solution, window.newest)
         if failure:
@@ -299,7 +301,11 @@ class InertialOdometry:
     def _view(self, tracks: Tracks) -> StartView:
         right = np.flatnonzero(tracks.stereo)
         n, none = len(tracks), np.zeros(len(right))
-        ray_right = self.rig.cameras[1].camera.unproject(tracks.px_right[right])[0] if len(right) else np.zeros((0, 3))
+        ray_right = (
+            self.rig.cameras[1].camera.unproject(tracks.px_right[right].astype(np.float64))[0]
+            if len(right)
+            else np.zeros((0, 3))
+        )
         own = np.zeros(n) if len(right) else tracks.inv_depth
         return StartView(
             tracks.t_ns, np.concatenate([tracks.id, tracks.id[right]]),
