@@ -24,7 +24,7 @@ from lodelight.localization.machine import Finder
 from lodelight.localization.tracker import Tracked, Tracker
 from lodelight.mapping.local import LocalMapper
 from lodelight.mapping.map import Map
-from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Message
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
 from lodelight.types import Array, Bools
 
@@ -71,7 +71,7 @@ class InertialFront:
         self._in_window: dict[int, int] = {}  # keyframes of the map by their stamps
         mapper.hold_poses = True  # the window has placed them, with the IMU
 
-    def feed(self, message: Message) -> Located | None:
+    def feed(self, message: Imu | Frame) -> Located | None:
         """One message; where it completes a frame, that frame."""
         clock = Stopwatch()
         step = self.odometry.feed_frame(message) if isinstance(message, Frame) else self.odometry.feed_imu(message)

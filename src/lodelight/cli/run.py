@@ -27,7 +27,9 @@ app = typer.Typer(add_completion=False)
 def run(
     source: Path = typer.Argument(..., help="A recording of any known format, or the number of a camera."),
     out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
-    sensors: str = typer.Option("", help="stereo, rgbd, or mono-, stereo-, rgbd-inertial; default: the most the source has."),
+    sensors: str = typer.Option(
+        "", help="stereo, rgbd, or mono-, stereo-, rgbd-inertial; default: the most the source has."
+    ),
     rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
     anchors: Path = typer.Option(None, help="anchors.toml: what is surveyed of the building."),
     gate: str = typer.Option("none", help="lights: keyframes must agree with the pose by coded lights; or none."),

@@ -218,7 +218,7 @@ class _Problem:
     def _stepped(self, at: _Guess, by: _Linearized) -> _Guess:
         H = by.H + np.diag(1e-9 * np.diag(by.H) + 1e-12)
         try:
-            d: Array = np.linalg.solve(H, by.b)
+            d = np.asarray(np.linalg.solve(H, by.b), np.float64)
         except np.linalg.LinAlgError:
             d = np.zeros(N)
         gravity = at.gravity + GRAVITY_M_S2 * by.tangent @ d[:2]
@@ -238,7 +238,7 @@ class _Problem:
 
     def _result(self, at: _Guess, by: _Linearized, behind: float) -> Alignment | str:
         try:
-            covariance: Array = np.linalg.inv(by.H)
+            covariance = np.asarray(np.linalg.inv(by.H), np.float64)
         except np.linalg.LinAlgError:
             return "the images do not determine the motion"
         dof = max(by.inliers * 2 - N, 1)
