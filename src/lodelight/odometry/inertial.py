@@ -44,12 +44,12 @@ class OdometryConfig:
     most_bias_gyro: float = 0.5
     most_bias_accel: float = 2.0
     start_iterations: int = 10
-    sigma_px: float = 1.0
+    sigma_px: float = 0.7
     vibration: float = 0.3
     klt: KltConfig = field(default_factory=KltConfig)
     start: StartConfig = field(default_factory=StartConfig)
     keyframes: KeyframeRule = field(default_factory=KeyframeRule)
-    window: WindowConfig = field(default_factory=WindowConfig)
+    window: WindowConfig = field(default_factory=lambda: WindowConfig(keyframes=12))
 
 
 @dataclass(frozen=True, eq=False)
