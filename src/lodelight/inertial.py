@@ -42,6 +42,7 @@ class Located:
     inserted : the keyframe that this frame became, -1 where it did not; why : the reason
     """
 
+    frame: Frame
     estimate: Estimate
     reference: int
     T_reference_body: SE3
@@ -115,14 +116,14 @@ class InertialFront:
         estimate = Estimate(
             t_ns, step.status, T_world_body, turn @ covariance @ turn.T, step.why, step.inliers, details
         )  # fmt: skip
-        return Located(estimate, self._reference, T_reference_body, inserted, step.keyframe)
+        return Located(step.frame, estimate, self._reference, T_reference_body, inserted, step.keyframe)
 
     def _nowhere(self, step: OdometryStep, clock: Stopwatch, why: str = "") -> Located:
         T = self.T_world_map @ step.state.T_world_body
         status = step.status if step.status in ("initializing", "lost") else "initializing"
         details = {"track_ms": clock.ms()}
         estimate = Estimate(step.frame.t_ns, status, T, LOST_COVARIANCE, why or step.why, 0, details)
-        return Located(estimate, -1, SE3.identity())
+        return Located(step.frame, estimate, -1, SE3.identity())
 
     def _found(self, step: OdometryStep) -> bool:
         """Look for a frame in the map that was given; sets where the odometry's frame lies in it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -262,8 +262,17 @@ class Slam:
             self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body))
         if located.inserted >= 0:
             self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.why, weight=1.0)
+            tags = self.tags.see(located.frame)
+            with self.map.lock:
+                self.tags.note(tags, located.inserted, SE3.identity(), estimate.covariance, own=True)
             self.mapping.submit(located.inserted)
-        return estimate
+        if not estimate.localized:
+            return estimate
+        T_world_body, covariance = self.tags.world(estimate.T_world_body), estimate.covariance
+        details = {**estimate.details, "aligned": float(self.tags.aligned)}
+        return replace(
+            estimate, T_world_body=T_world_body, covariance=self.tags.world_covariance(covariance), details=details
+        )
 
     def _insert(self, tracked: Tracked, decision: Decision, tags: Sequence[TagSighting] = ()) -> None:
         """The quick half of mapping, which the next frame needs; the rest is the worker's."""
