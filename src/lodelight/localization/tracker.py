@@ -29,7 +29,7 @@ MEDIAN_CHI2_2, MEDIAN_CHI2_3 = 1.386, 2.366  # of a chi-square distribution with
 SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it counts as sharp; more is a failure
 INLIERS = 0.95  # of right matches, which pass their test
 CHANCE_SIGMA = 3.0  # of the binomial distribution of those that agree by chance: so many are put down to it
-UNROLLINGS, SETTLED_PX = 3, 0.5  # of a rolling shutter: at most so many, until rows are moved by less than that
+UNROLLINGS, SETTLED_PX = 3, 1.0  # of a rolling shutter: at most so many, until rows are moved by less than that
 RADIAN_M = 3.0  # a turn by a radian takes as much out of view as this many metres
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
 
@@ -74,13 +74,7 @@ class Tracker:
                     break
         if fit.right < self.config.min_matches:
             return self._lost(t_ns, seen, predicted, f"{fit.solved.n_inliers} of {fit.tried} matches fit one pose")
-        T_world_body = fit.solved.T_world_body
-        if self.shutter.rolls:
-            seen, twist, T_world_body = self._unrolled(seen, twist, fit)
-            index = FeatureIndex(seen, self.camera.width, self.camera.height)
-        tracked = self.refine(t_ns, seen, T_world_body, fit.point, index, search=3.0)
-        tracked.twist = twist
-        return tracked
+        return self._settled(t_ns, seen, twist, fit, index)
 
     def refine(
         self, t_ns: int, seen: Features, T_world_body: SE3, point: Ints, index: FeatureIndex, search: float
@@ -117,7 +111,7 @@ class Tracker:
         fit = self._fit(T_world_body, seen, landmarks, pairs, self.config.search_px)
         if fit.right < self.config.min_matches:
             return self._lost(t_ns, seen, T_world_body, f"{fit.solved.n_inliers} of {fit.tried} matches fit there")
-        return self.refine(t_ns, seen, fit.solved.T_world_body, fit.point, index, search=3.0)
+        return self._settled(t_ns, seen, STILL, fit, index)
 
     def accept(self, tracked: Tracked) -> None:
         """Make this the last frame."""
@@ -148,19 +142,29 @@ class Tracker:
         point[match[match >= 0]] = sight.point[new][match >= 0]
         return point
 
+    def _settled(self, t_ns: int, seen: Features, twist: Array, fit: Fit, index: FeatureIndex) -> Tracked:
+        """From a first pose to the last one. twist : by which `seen` was straightened"""
+        T_world_body = fit.solved.T_world_body
+        if self.shutter.rolls:
+            seen, twist, T_world_body = self._unrolled(seen, twist, fit)
+            index = FeatureIndex(seen, self.camera.width, self.camera.height)
+        tracked = self.refine(t_ns, seen, T_world_body, fit.point, index, search=3.0)
+        tracked.twist = twist
+        return tracked
+
     def _unrolled(self, seen: Features, twist: Array, fit: Fit) -> tuple[Features, Array, SE3]:
         """A frame of a rolling shutter straightened by the turn that its own rows show; its twist and its pose."""
         used, T_world_body = np.flatnonzero(fit.point >= 0), fit.solved.T_world_body
-        xyz = self.map.points.xyz[fit.point[used]]
         for _ in range(UNROLLINGS):
-            solved, noise = self._solve(T_world_body, seen.take(used), xyz)
-            T_world_body, right = solved.T_world_body, used[solved.inliers]
-            if len(right) < self.config.min_matches:
+            if len(used) < self.config.min_matches:
                 break
-            xyz_cam = (T_world_body @ self.T_body_cam).inverse() @ xyz[solved.inliers]
-            sigma_px = noise * self._sigma_px(seen.take(right))
-            more = np.append(self.shutter.turn_left_over(seen.px[right], sigma_px, xyz_cam), np.zeros(3))
+            xyz = self.map.points.xyz[fit.point[used]]
+            xyz_cam = (T_world_body @ self.T_body_cam).inverse() @ xyz
+            turn = self.shutter.turn_left_over(seen.px[used], self._sigma_px(seen.take(used)), xyz_cam)
+            more = np.append(turn, np.zeros(3))
             seen, twist = self.shutter.straightened(seen, more), twist + more
+            solved, _ = self._solve(T_world_body, seen.take(used), xyz)
+            T_world_body, used = solved.T_world_body, used[solved.inliers]
             if self.shutter.reach_px(more) < SETTLED_PX:
                 break
         return seen, twist, T_world_body
