@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.mapping import invariants
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig, fuse_into
 from lodelight.mapping.map import Map
-from maps import large_map, room_map, thinned
+from maps import large_map, room_map, room_rig, thinned
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -43,6 +44,15 @@ def broken(change: Callable[[Map], object]) -> list[str]:
     map = room_map()
     change(map)
     return invariants.problems(map)
+
+
+def test_corners_of_a_rolling_shutter_may_lie_past_the_rim() -> None:
+    rig = room_rig()
+    rolling = replace(rig, cameras=(replace(rig.cameras[0], row_time_s=30e-6),))
+    for px, allowed in ([650.0, 10.0], True), ([720.0, 10.0], False):
+        map = room_map(rig=rolling)
+        map.features.px[5] = px
+        assert (invariants.problems(map) == []) is allowed
 
 
 def set_column(table: str, column: str, row: int, value: object) -> Callable[[Map], object]:

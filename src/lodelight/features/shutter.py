@@ -17,6 +17,7 @@ from lodelight.rig import CameraSpec
 from lodelight.types import AnyArray, Array
 
 STILL = np.zeros(6)
+BEYOND = 0.1  # of the image's width: so far outside of it a straightened corner may lie, as the first row never saw it
 STEP = 1e-4  # rad or m, of the central differences
 UNKNOWN_TURN = 1.0  # rad/s: how far a turn can be from the one before
 UNMEASURED = 1e-6  # information that keeps the system solvable where corners leave a direction open
@@ -34,13 +35,17 @@ class Shutter:
         return self.row_time_s > 0.0
 
     def straightened(self, seen: Features, twist: Array) -> Features:
-        """Corners as they would be at the stamp. Those without depth are taken for far away."""
+        """Corners as they would be at the stamp, some of them past the image's rim (see BEYOND).
+
+        Those without depth are taken for far away.
+        """
         if not self.rolls or len(seen) == 0 or not np.any(twist):
             return seen
         dt_s = self._delay_s(seen.px)
         shift = (dt_s * seen.inv_depth * seen.ray[:, 2])[:, None] * twist[3:]
         moved = _turned(seen.ray, dt_s[:, None] * twist[:3]) + shift  # in units of the distance to the point
-        px, visible = project_points(self.camera.model, self.camera.params, moved)  # past the image's rim too
+        px, visible = project_points(self.camera.model, self.camera.params, moved)
+        visible &= self.camera.inside(px, -BEYOND * self.camera.width)
         moved[~visible], px[~visible] = seen.ray[~visible], seen.px[~visible]
         near = np.divide(seen.ray[:, 2], moved[:, 2], out=np.ones(len(seen)), where=seen.inv_depth > 0)
         return replace(
@@ -50,7 +55,7 @@ class Shutter:
         )  # fmt: skip
 
     def turn_left_over(self, px: AnyArray, sigma_px: Array, xyz_cam: Array) -> Array:
-        """(3,) rad/s of turn that corners px (N, 2) still show, against points (N, 3) m in the camera's frame.
+        """(6,) rad/s of turn, and no velocity, that corners px (N, 2) still show, against points (N, 3) m in the camera's frame.
 
         Linear in the turn, and in the pose, which is free beside it: a turn moves later rows farther. Held near zero
         as far as few or badly spread corners leave it open.
@@ -61,7 +66,7 @@ class Shutter:
         A = (np.concatenate([delayed, turned, shifted], axis=2) / sigma_px[:, None, None]).reshape(-1, 9)
         r = ((expected - px) / sigma_px[:, None]).reshape(-1)
         H = A.T @ A + np.diag([UNKNOWN_TURN**-2] * 3 + [UNMEASURED] * 6)
-        out: Array = np.linalg.solve(H, A.T @ r)[:3]
+        out: Array = np.append(np.linalg.solve(H, A.T @ r)[:3], np.zeros(3))
         return out
 
     def reach_px(self, twist: Array) -> float:

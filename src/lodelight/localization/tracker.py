@@ -135,9 +135,7 @@ class Tracker:
         new = ~np.isin(sight.point, point[point >= 0])
         octave = sight.octave[new]
         radius = np.where(sight.cosine[new] > 0.998, 2.5, 4.0) * search * self.orb.scale(octave)
-        match = index.search(
-            sight.px[new], radius, (octave - 1, octave + 1), desc[new], free=free, ratio=0.8
-        )  # fmt: skip
+        match = index.search(sight.px[new], radius, (octave - 1, octave + 1), desc[new], free=free, ratio=0.8)
         point = point.copy()
         point[match[match >= 0]] = sight.point[new][match >= 0]
         return point
@@ -160,8 +158,7 @@ class Tracker:
                 break
             xyz = self.map.points.xyz[fit.point[used]]
             xyz_cam = (T_world_body @ self.T_body_cam).inverse() @ xyz
-            turn = self.shutter.turn_left_over(seen.px[used], self._sigma_px(seen.take(used)), xyz_cam)
-            more = np.append(turn, np.zeros(3))
+            more = self.shutter.turn_left_over(seen.px[used], self._sigma_px(seen.take(used)), xyz_cam)
             seen, twist = self.shutter.straightened(seen, more), twist + more
             solved, _ = self._solve(T_world_body, seen.take(used), xyz)
             T_world_body, used = solved.T_world_body, used[solved.inliers]

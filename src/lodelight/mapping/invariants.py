@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lodelight.features.shutter import BEYOND
 from lodelight.mapping.compact import REFERENCES
 from lodelight.mapping.map import Map
 from lodelight.types import AnyArray, Bools
@@ -106,6 +107,7 @@ def _keyframes(map: Map) -> list[str]:
 def _features(map: Map) -> list[str]:
     k, f = map.keyframes, map.features
     camera = map.rig.cameras[0].camera
+    beyond_px = BEYOND * camera.width if map.rig.cameras[0].row_time_s > 0.0 else 0.0
     alive = k.alive[f.keyframe]
     seen = np.flatnonzero(f.point >= 0)
     pairs = f.point[seen].astype(np.int64) * max(len(k), 1) + f.keyframe[seen]
@@ -113,7 +115,7 @@ def _features(map: Map) -> list[str]:
     again = np.ones(len(seen), np.bool_)
     again[first] = False
     return [
-        *_some(f"features outside the {camera.width}x{camera.height} image", alive & ~camera.inside(f.px)),
+        *_some(f"features outside the {camera.width}x{camera.height} image", alive & ~camera.inside(f.px, -beyond_px)),
         *_some("features of dead keyframes that still name a point", ~alive & (f.point >= 0)),
         *_some("features whose keyframe sees the same point twice", np.isin(np.arange(len(f)), seen[again])),
     ]
