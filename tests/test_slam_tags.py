@@ -1,5 +1,6 @@
 """Tags in SLAM with depth: a textured wall with tags on it, seen through an exact warp."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -8,9 +9,12 @@ import numpy as np
 import pytest
 
 from lodelight.anchors import Anchors, Tag
+from lodelight.cli.main import main
 from lodelight.fiducials import fiducial_modules
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
+from lodelight.io.anchors_toml import read_anchors, write_anchors
+from lodelight.io.rig_toml import write_rig
 from lodelight.mapping.invariants import problems
 from lodelight.mapping.store import load_map, save_map
 from lodelight.messages import Frame
@@ -139,3 +143,47 @@ def test_without_anchors_squares_are_not_looked_for(frames):
     assert slam.tags.detector.families == ("qr",)
     assert len(slam.map.tags) == 0
     assert not [f for kind, f in events if kind in ("tag", "aligned")]
+
+
+def recording(folder, frames):
+    """The frames as a TUM RGB-D folder that knows where its tags hang."""
+    rows = {"rgb": [], "depth": []}
+    for f in frames:
+        stamp = f"{f.t_ns // 10**9}.{f.t_ns % 10**9:09d}"
+        depth = np.round(f.depth * 5000.0).astype(np.uint16)
+        for kind, image in (("rgb", f.images[0]), ("depth", depth)):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / kind / f"{stamp}.png"), image)
+            rows[kind].append(f"{stamp} {kind}/{stamp}.png\n")
+    for kind, lines in rows.items():
+        (folder / f"{kind}.txt").write_text("".join(lines))
+    write_rig(folder / "rig.toml", Rig(RIG.cameras, depth=replace(RIG.depth, units_per_m=5000.0)))
+    write_anchors(folder / "anchors.toml", Anchors(tuple(map(surveyed, TAGS))))
+    return folder
+
+
+def test_the_survey_of_a_recording_is_written_and_measured(frames, tmp_path, capsys):
+    source = recording(tmp_path / "wall", frames)
+    write_anchors(tmp_path / "sizes.toml", Anchors(tuple(replace(tag, T_world_tag=None) for tag in TAGS)))
+    out = tmp_path / "out"
+    args = ["--anchors", str(tmp_path / "sizes.toml"), "--out", str(out), "--json"]
+    assert main(["tags", "map", str(source), *args]) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["tags"] == 3
+    assert metrics["tag_errors"]["count"] == 3
+    assert metrics["tag_errors"]["max_m"] < 0.02
+    assert {tag.id for tag in read_anchors(out / "anchors.toml").tags} == {"1", "2", "3"}
+    assert cv2.imread(str(out / "tags.png")).shape[0] > 100
+    header = (out / "cloud.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "comment tag 1 is tag36h11 1" in header
+    assert "property int tag" in header
+    # and from there: another run in the world of that survey
+    args = ["run", str(source), "--anchors", str(source / "anchors.toml"), "--out", str(out), "--json"]
+    assert main(args) == 0
+    assert json.loads(capsys.readouterr().out)["aligned"] is True
+
+
+def test_a_recording_without_tags_of_known_size_is_a_failure_in_one_line(frames, tmp_path, capsys):
+    source = recording(tmp_path / "wall", frames[:5])
+    assert main(["tags", "map", str(source), "--out", str(tmp_path / "out")]) == 1
+    assert "no tag could be mapped" in capsys.readouterr().err

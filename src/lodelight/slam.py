@@ -192,7 +192,7 @@ class Slam:
             self.emit(frame.t_ns, "keyframe", inserted=decision.insert, why=decision.why, weight=decision.weight)
             if decision.insert:
                 self._insert(tracked, decision, tags)
-            elif tags:
+            elif tags and not self.localization_only:
                 with self.map.lock:
                     covariance = self._covariance(tracked)
                     self.tags.note(tags, tracked.reference, tracked.T_reference_body, covariance, own=False)

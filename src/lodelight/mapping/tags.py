@@ -12,19 +12,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lodelight.anchors import Tag, tag_corners
+from lodelight.anchors import Tag
 from lodelight.features.orb import OrbConfig
-from lodelight.geometry.se3 import SE3, carried_covariance
+from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
+from lodelight.mapping.tag_alignment import consensus, looseness, off_m
 from lodelight.mapping.tag_corners import tag_world
 from lodelight.mapping.tag_correction import correct_by_tags
+from lodelight.mapping.tag_views import find_tag, misfit_px, pose_of_view, tag_key, tag_name, views_of
 from lodelight.messages import Frame, TagSighting
 from lodelight.tags.detect import TagConfig, TagDetector
 from lodelight.tags.gate import GateConfig, KnownTag, TagGate, Verdict
-from lodelight.tags.survey import MappedTag, SurveyConfig, TagView, map_tag
+from lodelight.tags.survey import MappedTag, SurveyConfig, Unmapped, map_tag
 from lodelight.types import Array
 
-AGREE_M = 0.3  # that a tag may be off its survey, as an alignment by another one has it
 EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
 
 
@@ -72,7 +73,6 @@ class MapTags:
         self.book = TagGate(tags, self.config.gate)  # in the world's frame: what is surveyed and what payloads claim
         self.gate = TagGate((), self.config.gate, self._named)  # in the map's
         self.T_world_map: SE3 | None = None
-        self.corrections = 0
         self._told: set[str] = set()
         self._fresh: set[int] = set()  # tags with views that came since they were mapped last
         self._alignment: list[str] = []  # surveyed tags that the alignment rests on
@@ -105,7 +105,7 @@ class MapTags:
             if (s.family, s.id) not in self.gate.tags:
                 self._expect(s)
         for verdict in self.gate.judge(sightings, self.spec, T_map_body, covariance):
-            tag = self._row(verdict.sighting)
+            tag = find_tag(self.map, verdict.sighting.name)
             disputed = verdict.kind == "contradicts" and self._disputable(tag)
             if (verdict.usable or verdict.kind == "new" or disputed) and (own or self._apart(tag, T_map_body)):
                 self._keep(tag, verdict, reference, T_reference_body, own)
@@ -123,16 +123,16 @@ class MapTags:
             t_ns = int(self.map.keyframes.t_ns[keyframe])
             self._map_fresh(t_ns)
             self._align(t_ns)
-            misfit_px = self._misfit_px(keyframe)
-        if misfit_px > self.config.correct_px:
-            self._correct(t_ns, misfit_px, stop)
+            worst_px = misfit_px(self.map, keyframe)
+        if worst_px > self.config.correct_px:
+            self._correct(t_ns, worst_px, stop)
 
     def prepare(self) -> None:
         """Before the last adjustment of the whole map: place every tag, and bend the map where it does not fit them."""
         if not len(self.map.tags):
             return
         t_ns = self._settle()
-        worst = max((self._misfit_px(int(k)) for k in self.map.alive_keyframes), default=0.0)
+        worst = max((misfit_px(self.map, int(k)) for k in self.map.alive_keyframes), default=0.0)
         if worst > self.config.correct_px:
             self._correct(t_ns, worst, None)
 
@@ -178,25 +178,12 @@ class MapTags:
 
     def found(self) -> list[Tag]:
         """All placed tags where they hang in the world (or in the map, where it is not aligned)."""
-        out = []
-        for i in np.flatnonzero(self.map.tags.placed):
-            family, _, id = _name(self.map, int(i)).partition(" ")
-            sigma_m = math.sqrt(float(np.trace(self.map.tags.covariance[i][3:, 3:])) / 3.0)
-            out.append(
-                Tag(
-                    family,
-                    id,
-                    float(self.map.tags.size_m[i]),
-                    self.world(tag_world(self.map, int(i))),
-                    max(sigma_m, 1e-4),
-                )
-            )
+        out, tags = [], self.map.tags
+        for i in np.flatnonzero(tags.placed).tolist():
+            sigma_m = math.sqrt(float(np.trace(tags.covariance[i][3:, 3:])) / 3.0)
+            T = self.world(tag_world(self.map, i))
+            out.append(Tag(*tag_key(self.map, i), float(tags.size_m[i]), T, max(sigma_m, 1e-4)))
         return sorted(out, key=lambda tag: (tag.family, tag.id))
-
-    def views_of(self, tag: Tag) -> int:
-        """How many views a tag was placed from."""
-        row = self._find(f"{tag.family} {tag.id}")
-        return int(np.count_nonzero(self.map.tag_views.usable & (self.map.tag_views.tag == row)))
 
     # -- sightings ----------------------------------------------------------------------------------------------
 
@@ -218,7 +205,7 @@ class MapTags:
     def _expect(self, s: TagSighting) -> None:
         """Enter a tag that is seen for the first time: where its survey puts it, if the map is aligned."""
         assert s.size_m is not None
-        row = self._find(s.name)
+        row = find_tag(self.map, s.name)
         if row < 0:
             row = self.map.tags.append(1, name=np.array([s.name.encode()]), size_m=s.size_m, R=np.eye(3))
         self.gate.tags[s.family, s.id] = KnownTag(s.family, s.id, s.size_m)
@@ -237,7 +224,7 @@ class MapTags:
         rows = np.flatnonzero(self.map.tag_views.tag == tag)
         if not len(rows):
             return True
-        T = self._pose_of_view(int(rows[-1])).inverse() @ T_map_body
+        T = pose_of_view(self.map, int(rows[-1])).inverse() @ T_map_body
         return float(np.linalg.norm(T.t)) > self.config.apart_m or math.degrees(T.angle) > self.config.apart_deg
 
     # -- places -------------------------------------------------------------------------------------------------
@@ -247,36 +234,24 @@ class MapTags:
         for tag in sorted(self._fresh):
             if self.map.tags.surveyed[tag]:
                 continue
-            found = map_tag(self._views(tag), float(self.map.tags.size_m[tag]), self.spec.camera, self.config.survey)
+            found = self._by_views(tag)
             if isinstance(found, MappedTag):
                 self._place(tag, found.T_world_tag, found.covariance)
             elif "agree" in found.why:
-                self._tell(t_ns, _name(self.map, tag), "contradicts", found.why)
+                self._tell(t_ns, tag_name(self.map, tag), "contradicts", found.why)
         self._fresh.clear()
+
+    def _by_views(self, tag: int, every: bool = False) -> MappedTag | Unmapped:
+        views = views_of(self.map, tag, self.config.max_views, every)
+        return map_tag(views, float(self.map.tags.size_m[tag]), self.spec.camera, self.config.survey)
 
     def _place(self, tag: int, T_map_tag: SE3, covariance: Array) -> None:
         tags = self.map.tags
         tags.R[tag], tags.p[tag], tags.covariance[tag], tags.placed[tag] = T_map_tag.R, T_map_tag.t, covariance, True
-        family, _, id = _name(self.map, tag).partition(" ")
+        family, id = tag_key(self.map, tag)
         self.gate.tags[family, id] = KnownTag(
             family, id, float(tags.size_m[tag]), T_map_tag, covariance, bool(tags.surveyed[tag])
         )  # fmt: skip
-
-    def _views(self, tag: int, every: bool = False) -> list[TagView]:
-        """The usable views of a tag, or every one, evenly thinned."""
-        rows = np.flatnonzero((self.map.tag_views.usable | every) & (self.map.tag_views.tag == tag))
-        if len(rows) > self.config.max_views:
-            rows = rows[np.linspace(0, len(rows) - 1, self.config.max_views).round().astype(int)]
-        v, views = self.map.tag_views, []
-        for i in rows.tolist():
-            T_map_cam = self._pose_of_view(i) @ self.spec.T_body_cam
-            family, _, id = _name(self.map, tag).partition(" ")
-            views.append(TagView(TagSighting(int(v.t_ns[i]), family, id, v.px[i], v.sigma_px[i]), T_map_cam))
-        return views
-
-    def _pose_of_view(self, view: int) -> SE3:
-        v = self.map.tag_views
-        return self.map.pose(int(v.keyframe[view])) @ SE3(v.R[view], v.p[view])
 
     # -- the world ----------------------------------------------------------------------------------------------
 
@@ -289,31 +264,27 @@ class MapTags:
         if self.T_world_map is not None and not self._doubt:
             return
         self._doubt = False
-        found = {i: T for i in range(len(self.map.tags)) if self._surveyed(i) and (T := self._mapped(i)) is not None}
-        best: tuple[list[int], float, int, SE3] | None = None
-        for i, T_map_tag in found.items():
-            T_world_map = self._survey_of(i) @ T_map_tag.inverse()
-            agreeing = [j for j, T in found.items() if self._off_m(j, T_world_map @ T) < AGREE_M]
-            spread = float(np.trace(self.map.tags.covariance[i][3:, 3:]))
-            if best is None or (len(agreeing), -spread) > (len(best[0]), -best[1]):
-                best = agreeing, spread, i, T_world_map
-        if best is None or (len(best[0]) < 2 and (len(found) > 1 or self.T_world_map is not None)):
-            if best is not None and len(found) > 1:
-                names = ", ".join(_name(self.map, i) for i in found)
+        known = [i for i in range(len(self.map.tags)) if self._surveyed(i) is not None]
+        found = {i: T for i in known if (T := self._mapped(i)) is not None}
+        spread = {i: float(np.trace(self.map.tags.covariance[i][3:, 3:])) for i in found}
+        best = consensus(found, {i: self._survey_of(i) for i in found}, spread)
+        if best is None:
+            return
+        if len(best.agreeing) < 2 and (len(found) > 1 or self.T_world_map is not None):
+            if len(found) > 1:
+                names = ", ".join(tag_name(self.map, i) for i in found)
                 self._tell(t_ns, names, "contradicts", "no two of them agree on where the map is")
             return
-        held = {self._find(name) for name in self._alignment}
-        if self.T_world_map is None or not held & set(best[0]):
-            self.T_world_map = best[3]
-            self.emit(t_ns, "aligned", tag=_name(self.map, best[2]), agreeing=len(best[0]))
-        self._alignment = [_name(self.map, i) for i in best[0]]
-        for i in range(len(self.map.tags)):  # those that do not agree may come to: the gate will say
-            if self._surveyed(i) is not None:
-                self.map.tag_views.usable[self.map.tag_views.tag == i] = i in best[0]
-        for i, T in found.items():
-            if i not in best[0] and len(best[0]) > 1:
-                self._distrust(t_ns, i, T, self._off_m(i, self.T_world_map @ T))
-        for i in range(len(self.map.tags)):
+        held = {find_tag(self.map, name) for name in self._alignment}
+        if self.T_world_map is None or not held & set(best.agreeing):
+            self.T_world_map = best.T_world_map
+            self.emit(t_ns, "aligned", tag=tag_name(self.map, best.by), agreeing=len(best.agreeing))
+        self._alignment = [tag_name(self.map, i) for i in best.agreeing]
+        for i in known:  # those that do not agree may come to: the gate will say
+            self.map.tag_views.usable[self.map.tag_views.tag == i] = i in best.agreeing
+        for i in sorted(set(found) - set(best.agreeing)) if len(best.agreeing) > 1 else ():
+            self._distrust(t_ns, i, found[i], off_m(self.T_world_map @ found[i], self._survey_of(i)))
+        for i in known:
             self._survey(i)
 
     def _disputable(self, tag: int) -> bool:
@@ -322,7 +293,7 @@ class MapTags:
 
     def _named(self, t_ns: int, kind: str, tag: str, verdict: str, why: str) -> None:
         """The gate found a tag wrong; or the only one that it was judged by."""
-        if self._disputable(self._find(tag)):
+        if self._disputable(find_tag(self.map, tag)):
             why = f"{why}; or {self._alignment[0]} is not where it was surveyed"
             tag = f"{tag}, {self._alignment[0]}"
         self._tell(t_ns, tag, verdict, why)
@@ -331,17 +302,12 @@ class MapTags:
         """Where a tag hangs by its views alone, whatever its survey says."""
         if not self.map.tags.surveyed[tag]:
             return tag_world(self.map, tag) if self.map.tags.placed[tag] else None
-        found = map_tag(
-            self._views(tag, every=True), float(self.map.tags.size_m[tag]), self.spec.camera, self.config.survey
-        )
+        found = self._by_views(tag, every=True)
         return found.T_world_tag if isinstance(found, MappedTag) else None
-
-    def _off_m(self, tag: int, T_world_tag: SE3) -> float:
-        return float(np.linalg.norm(T_world_tag.t - self._survey_of(tag).t))
 
     def _distrust(self, t_ns: int, tag: int, T_map_tag: SE3, off_m: float) -> None:
         """Forget the survey of a tag that hangs elsewhere."""
-        name = _name(self.map, tag)
+        name = tag_name(self.map, tag)
         self._distrusted.add(name)
         self.map.tag_views.usable[self.map.tag_views.tag == tag] = True  # they show where it hangs, and that is all
         self.map.tags.surveyed[tag] = False
@@ -355,9 +321,8 @@ class MapTags:
         return known.T_world_tag
 
     def _surveyed(self, row: int) -> KnownTag | None:
-        name = _name(self.map, row)
-        family, _, id = name.partition(" ")
-        known = self.book.tags.get((family, id))
+        name = tag_name(self.map, row)
+        known = self.book.tags.get(tag_key(self.map, row))
         usable = known is not None and known.T_world_tag is not None and name not in self._distrusted
         return known if usable else None
 
@@ -367,54 +332,29 @@ class MapTags:
         if self.T_world_map is None or survey is None or survey.T_world_tag is None:
             return
         T_map_tag = self.T_world_map.inverse() @ survey.T_world_tag
+        anchors = [tag_world(self.map, i) for name in self._alignment if (i := find_tag(self.map, name)) >= 0]
         self.map.tags.surveyed[row] = True
-        self._place(row, T_map_tag, survey.covariance + self._looseness(T_map_tag))
-
-    def _looseness(self, T_map_tag: SE3) -> Array:
-        """(6, 6) of where the alignment, which rests on a few tags, puts another one."""
-        anchors = [i for name in self._alignment if (i := self._find(name)) >= 0]
-        if not anchors:
-            return np.zeros((6, 6))
-        spots = self.map.tags.p[anchors]
-        nearest = int(np.argmin(np.linalg.norm(spots - T_map_tag.t, axis=1)))
-        base_m = float(np.max(np.linalg.norm(spots - spots[nearest], axis=1)))
-        turn = min(math.radians(1.0), 0.03 / base_m) if base_m > 0.0 else math.radians(1.0)
-        known = np.diag([turn**2] * 3 + [0.01**2] * 3)
-        return carried_covariance(tag_world(self.map, anchors[nearest]), known, T_map_tag)
+        self._place(row, T_map_tag, survey.covariance + looseness(anchors, T_map_tag))
 
     # -- corrections --------------------------------------------------------------------------------------------
 
-    def _misfit_px(self, keyframe: int) -> float:
-        """Largest distance between seen and expected corners of the placed tags in a keyframe, in their median."""
-        v, tags = self.map.tag_views, self.map.tags
-        worst = 0.0
-        for i in np.flatnonzero((v.keyframe == keyframe) & v.own & v.usable & tags.placed[v.tag]).tolist():
-            tag = int(v.tag[i])
-            corners = tag_world(self.map, tag) @ tag_corners(float(tags.size_m[tag]))
-            T_map_cam = self.map.pose(keyframe) @ self.spec.T_body_cam
-            px, seen = self.spec.camera.project(T_map_cam.inverse() @ corners)
-            off = float(np.median(np.linalg.norm(px - v.px[i], axis=1))) if seen.all() else math.inf
-            worst = max(worst, off)
-        return worst
-
-    def _correct(self, t_ns: int, misfit_px: float, stop: Callable[[], bool] | None) -> None:
+    def _correct(self, t_ns: int, worst_px: float, stop: Callable[[], bool] | None) -> None:
         moved_m = correct_by_tags(self.map, self.orb, self.sigma_px, self.config.iterations, stop)
-        self.corrections += 1
         with self.map.lock:
             seen = np.unique(self.map.tag_views.tag[self.map.tag_views.usable])
-            self._alignment = [_name(self.map, int(i)) for i in seen if self.map.tags.surveyed[i]] or self._alignment
+            self._alignment = [tag_name(self.map, int(i)) for i in seen if self.map.tags.surveyed[i]] or self._alignment
             self._fresh |= {int(i) for i in seen}
             self._map_fresh(t_ns)
             for i in range(len(self.map.tags)):
                 self._survey(i)
-        self.emit(t_ns, "tags", corrected=True, misfit_px=misfit_px, moved_m=moved_m, surveyed=len(self._alignment))
+        self.emit(t_ns, "tags", corrected=True, misfit_px=worst_px, moved_m=moved_m, surveyed=len(self._alignment))
 
     # -- small things -------------------------------------------------------------------------------------------
 
     def _recall(self) -> None:
         """What a loaded map knows of tags; one with a surveyed tag is in the world already."""
         for i in range(len(self.map.tags)):
-            family, _, id = _name(self.map, i).partition(" ")
+            family, id = tag_key(self.map, i)
             size_m, placed = float(self.map.tags.size_m[i]), bool(self.map.tags.placed[i])
             self.gate.tags[family, id] = KnownTag(
                 family, id, size_m, tag_world(self.map, i) if placed else None, self.map.tags.covariance[i].copy(),
@@ -422,21 +362,10 @@ class MapTags:
             )  # fmt: skip
         if np.any(self.map.tags.surveyed):
             self.T_world_map = SE3.identity()
-            self._alignment = [_name(self.map, int(i)) for i in np.flatnonzero(self.map.tags.surveyed)]
-
-    def _row(self, s: TagSighting) -> int:
-        return self._find(s.name)
-
-    def _find(self, name: str) -> int:
-        rows = np.flatnonzero(self.map.tags.name == name.encode())
-        return int(rows[0]) if len(rows) else -1
+            self._alignment = [tag_name(self.map, int(i)) for i in np.flatnonzero(self.map.tags.surveyed)]
 
     def _tell(self, t_ns: int, name: str, verdict: str, why: str) -> None:
         """Each complaint once."""
         if f"{name} {verdict}" not in self._told:
             self._told.add(f"{name} {verdict}")
             self.emit(t_ns, "tag", tag=name, verdict=verdict, why=why)
-
-
-def _name(map: Map, row: int) -> str:
-    return bytes(map.tags.name[row]).decode()
