@@ -15,6 +15,7 @@ import numpy as np
 
 from lodelight.estimation.bundle import bundle_adjust
 from lodelight.estimation.bundle_problem import BundleProblem
+from lodelight.estimation.factors.pose_prior import PosePrior
 from lodelight.estimation.factors.reprojection import CHI2_PX
 from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
@@ -239,16 +240,20 @@ def adjust(
     stop: Callable[[], bool] | None,
     newest: int | None = None,
     hold_poses: bool = False,
+    pose_sigma: tuple[float, float] | None = None,
 ) -> None:
     """Bundle adjustment of `window` keyframes and what they see; observations that do not fit are unlinked.
 
     newest : keyframe whose covariance is found as well; hold_poses : only points are adjusted
+    pose_sigma : poses are believed where they stand, to so many rad and m; None = not at all
     """
     with map.lock:
         problem, keyframes, points, rows = bundle_of(map, window, orb, sigma_px)
         tied = with_tag_corners(map, problem, keyframes, window)
         if hold_poses:
             tied = replace(tied, fixed=np.ones(len(tied.fixed), bool))
+        if pose_sigma is not None:
+            tied = replace(tied, priors=[*tied.priors, *_where_they_stand(tied, pose_sigma)])
     wanted = [] if newest is None else [int(np.searchsorted(keyframes, newest))]
     result = bundle_adjust(tied, iterations=iterations, stop=stop, covariance_of=wanted)
     with map.lock:
@@ -258,6 +263,11 @@ def adjust(
         still = map.features.point[rows] == points[problem.point]
         map.unlink(rows[~result.inliers[: len(rows)] & still])
         map.refresh_points(points[map.points.alive[points]], orb.scale_factor, orb.n_levels)
+
+
+def _where_they_stand(problem: BundleProblem, pose_sigma: tuple[float, float]) -> list[PosePrior]:
+    information = np.diag(np.repeat(pose_sigma, 3) ** -2.0)
+    return [PosePrior(int(k), SE3(problem.R[k], problem.p[k]), information) for k in np.flatnonzero(~problem.fixed)]
 
 
 def bundle_of(map: Map, window: Ints, orb: OrbConfig, sigma_px: float) -> tuple[BundleProblem, Ints, Ints, Ints]:
