@@ -55,7 +55,7 @@ class Shutter:
         )  # fmt: skip
 
     def turn_left_over(self, px: AnyArray, sigma_px: Array, xyz_cam: Array) -> Array:
-        """(6,) rad/s of turn, and no velocity, that corners px (N, 2) still show, against points (N, 3) m, camera frame.
+        """(6,) rad/s of turn, and no velocity, that corners px (N, 2) still show; points (N, 3) m, camera frame.
 
         Linear in the turn, and in the pose, which is free beside it: a turn moves later rows farther. Held near zero
         as far as few or badly spread corners leave it open.
