@@ -34,7 +34,7 @@ class StartConfig:
     """rest_s : standing still for so long starts; longest_s : of images that are kept
     shortest_s : in motion, with one camera; shortest_metric_s : with two, or depth
     rest_px, rest_gyro, rest_accel : standing still moves the image by no more (median), and deviates by no more,
-        rad/s and m/s^2
+        rad/s and m/s^2; a drone's motors may run
     min_tracks : landmarks seen from the first to the last image
     min_parallax_deg : of them, what one camera alone needs
     max_scale, max_tilt_deg, max_velocity : standard deviations above which it is too early; m/s
@@ -48,8 +48,8 @@ class StartConfig:
     shortest_metric_s: float = 0.7
     longest_s: float = 1.9
     rest_px: float = 0.75
-    rest_gyro: float = 0.02
-    rest_accel: float = 0.25
+    rest_gyro: float = 0.1
+    rest_accel: float = 1.2
     min_tracks: int = 25
     min_parallax_deg: float = 1.0
     max_scale: float = 0.06

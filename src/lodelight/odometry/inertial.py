@@ -35,6 +35,8 @@ class OdometryConfig:
     blind_s : without them for so long, and the IMU alone is believed no more
     most_speed m/s, most_bias_gyro rad/s, most_bias_accel m/s^2 : a window that believes more has failed
     start_iterations : of the first solution; sigma_px : noise of a track in the window
+    still_px, still_gyro, still_accel : a frame whose tracks moved and whose IMU deviates by less has no velocity; px,
+        rad/s, m/s^2
     vibration : share of the accelerometer's fast changes that counts as white noise (imu/vibration.py)
     """
 
@@ -45,6 +47,9 @@ class OdometryConfig:
     most_bias_accel: float = 2.0
     start_iterations: int = 10
     sigma_px: float = 0.7
+    still_px: float = 0.35
+    still_gyro: float = 0.02
+    still_accel: float = 0.25
     vibration: float = 0.3
     klt: KltConfig = field(default_factory=KltConfig)
     start: StartConfig = field(default_factory=StartConfig)
@@ -191,9 +196,9 @@ class InertialOdometry:
 
     def _still(self, imu: ImuSamples) -> bool:
         """Whether nothing moves: neither the tracks since the last frame, nor the IMU."""
-        c, flow = self.config.start, self.tracker.flow
-        quiet = imu.gyro.std(axis=0).max() < c.rest_gyro and imu.accel.std(axis=0).max() < c.rest_accel
-        return bool(quiet and flow.followed >= c.min_tracks and flow.moved_px < 0.5 * c.rest_px)
+        c, flow = self.config, self.tracker.flow
+        quiet = imu.gyro.std(axis=0).max() < c.still_gyro and imu.accel.std(axis=0).max() < c.still_accel
+        return bool(quiet and flow.followed >= c.start.min_tracks and flow.moved_px < c.still_px)
 
     # -- start, failure -----------------------------------------------------------------------------------------
 
