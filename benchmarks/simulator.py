@@ -1,6 +1,6 @@
 """The simulator against its figures: speed, exactness, texture, codes, lights.
 
-    python benchmarks/simulator.py            # the table; about five minutes on two cores
+    python benchmarks/simulator.py            # the table; some ten minutes on two cores
     python benchmarks/simulator.py --plot gradients.png --real recordings/euroc/mav0/cam0/data
 
 Run it on a quiet machine: the speeds are wall time. CPU time stands beside them.
@@ -267,7 +267,7 @@ def main() -> None:
         found = repeats()
         row("same seed, same bytes", "runs, processes, threads", "equal" if len(set(found)) == 1 else str(found))
     for kind in ("cart", "walk", "drone", "hand"):
-        motions = [prepare(Request("office", seed, 60.0, kind)).motion for seed in range(3)]
+        motions = [prepare(Request("office", seed, 60.0, kind), lit=False).motion for seed in range(3)]
         for fine, rule in ((True, "cubic"), (False, "midpoint rule")):
             m, deg = np.max([drift(motion, fine=fine) for motion in motions], axis=0)
             row(
