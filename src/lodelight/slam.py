@@ -109,7 +109,8 @@ class Slam:
         self.lights = _light_anchor(self.map, self.config, anchors or Anchors(), self.emit)
         self.gates = (*gates, self.lights.ask) if self.lights and self.config.gate.use == "lights" else gates
         places = Places(self.map)
-        self.machine = LocalizationMachine(self.tracker, Relocalizer(self.map, self.config.orb, places).find)
+        find = Relocalizer(self.map, self.config.orb, places).find
+        self.machine = LocalizationMachine(self.tracker, find)
         self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
         self.loops = LoopCloser(self.map, self.config.orb, places, self.config.loops, self.emit)
         known = anchors.tags if anchors is not None else ()
@@ -117,7 +118,6 @@ class Slam:
         self.inertial: InertialFront | None = None
         if inertial:
             odometry = InertialOdometry(rig, visual, self.config.inertial, self.emit, self.config.seed)
-            find = Relocalizer(self.map, self.config.orb, places).find
             self.inertial = InertialFront(
                 odometry, self.map, self.front_end, self.tracker, self.mapper, find, self.emit
             )  # fmt: skip

@@ -120,7 +120,7 @@ class Recording(ABC):
         if CAMERAS[base] > len(rig.cameras) or (base == "rgbd" and not rig.depth) or (suffix and not rig.imu):
             raise SourceError(f"{self.path} with its rig cannot serve {sensors}; the most it can is {rig.sensors}")
         frames = self.frames(CAMERAS[base], base == "rgbd", start_s, end_s)
-        return self._woven(frames, self.inertial(start_s, end_s)) if suffix else frames
+        return woven(frames, self.inertial(start_s, end_s)) if suffix else frames
 
     def frames(
         self, cameras: int, depth: bool, start_s: float = 0.0, end_s: float = math.inf
@@ -194,11 +194,6 @@ class Recording(ABC):
                     self.skipped.append(item)
         if not usable:
             raise SourceError(self._why_nothing())
-
-    def _woven(self, frames: Generator[Frame, None, None], imu: Iterator[Imu]) -> Iterator[Message]:
-        streams: tuple[Iterator[Message], Iterator[Message]] = (imu, frames)
-        with closing(frames):  # the decoding thread ends with this iterator
-            yield from heapq.merge(*streams, key=lambda message: message.t_ns)
 
     def _why_nothing(self) -> str:
         if not self.skipped:

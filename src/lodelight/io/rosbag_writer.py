@@ -21,6 +21,7 @@ import numpy as np
 from lodelight.errors import SourceError
 from lodelight.geometry.cameras import EQUIDISTANT, RADTAN, Camera
 from lodelight.geometry.se3 import SE3
+from lodelight.io.odometry_bag import covariance_to_ros
 from lodelight.io.stamps import NS_PER_S, seconds_text
 from lodelight.types import AnyArray, Array, Bytes
 
@@ -176,7 +177,7 @@ class BagWriter:
         """covariance : (6, 6) in the chart of SE3.perturbed; the message has it in ROS's order and axes."""
         pose = self.make("geometry_msgs/PoseWithCovariance", pose=self.pose(T_world_body), covariance=np.zeros(36))
         if covariance is not None:
-            pose.covariance = ros_covariance(T_world_body, covariance).ravel()
+            pose.covariance = covariance_to_ros(T_world_body.R, covariance).ravel()
         zero = self.make("geometry_msgs/Twist", linear=self._vector((0, 0, 0)), angular=self._vector((0, 0, 0)))
         return self.make(
             "nav_msgs/Odometry",
@@ -239,25 +240,6 @@ class BagWriter:
     def _quaternion(self, xyzw: Iterable[float]) -> Any:
         x, y, z, w = xyzw
         return self.make("geometry_msgs/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
-
-
-def ros_covariance(T_world_body: SE3, covariance: Array) -> Array:
-    """(6, 6) as ROS has it: position first, and both in the axes of the parent frame.
-
-    covariance : rotation in body axes first, then position in world axes. A rotation dθ of the body is R dθ there.
-    """
-    turned = np.zeros((6, 6))
-    turned[:3, 3:] = np.eye(3)
-    turned[3:, :3] = T_world_body.R
-    return np.asarray(turned @ covariance @ turned.T)
-
-
-def from_ros_covariance(T_world_body: SE3, covariance: Array) -> Array:
-    """The inverse of `ros_covariance`."""
-    turned = np.zeros((6, 6))
-    turned[:3, 3:] = T_world_body.R.T
-    turned[3:, :3] = np.eye(3)
-    return np.asarray(turned @ covariance @ turned.T)
 
 
 def _transient_local() -> Any:

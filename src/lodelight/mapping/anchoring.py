@@ -56,10 +56,6 @@ class Anchoring:
         for there in self._sightings.values():
             there.pop(light, None)
 
-    @property
-    def n_sightings(self) -> int:
-        return sum(map(len, self._sightings.values()))
-
     def holds(self, window: Ints) -> bool:
         """Whether the keyframes of a window are tied to the world in all six degrees of freedom."""
         here = [int(k) for k in window]
