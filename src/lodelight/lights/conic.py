@@ -11,24 +11,21 @@ from lodelight.errors import SourceError
 from lodelight.types import Array
 
 
-def disc_axes(normal: Array) -> Array:
-    """(2, 3): two unit vectors across a unit normal."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = np.cross(normal, helper)
-    first /= np.linalg.norm(first)
-    return np.array([first, np.cross(normal, first)])
+def image_of_disc(centre: Array, normal: Array, radius_m: float | Array) -> Array:
+    """(..., 3, 3) symmetric, the dual conic that a disc's rim is seen as; centre, unit normal (..., 3) in the camera.
 
-
-def image_of_disc(centre: Array, normal: Array, radius_m: float) -> Array:
-    """Matrix (3, 3), symmetric, of the dual conic that a disc's rim is seen as; centre, normal (3,) in the camera."""
-    H = np.vstack([radius_m * disc_axes(normal), centre]).T
-    dual: Array = H @ np.diag([1.0, 1.0, -1.0]) @ H.T
+    With axes a, b across the normal and H = [r a, r b, c] it is H diag(1, 1, -1) H^T = r^2 (I - n n^T) - c c^T.
+    """
+    r2 = np.asarray(radius_m)[..., None, None] ** 2
+    dual: Array = (
+        r2 * (np.eye(3) - normal[..., :, None] * normal[..., None, :]) - centre[..., :, None] * centre[..., None, :]
+    )
     return dual
 
 
 def conic_centre(dual: Array) -> Array:
-    """(2,), normalized, of an ellipse given by its dual conic: not where the disc's centre is seen, but near it."""
-    centre: Array = dual[:2, 2] / dual[2, 2]
+    """(..., 2), normalized, of ellipses given by their dual conics: not where a disc's centre is seen, but near it."""
+    centre: Array = dual[..., :2, 2] / dual[..., 2, 2, None]
     return centre
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -17,14 +18,15 @@ import numpy as np
 from lodelight.anchors import Light
 from lodelight.geometry.p3p import p3p
 from lodelight.geometry.se3 import SE3
-from lodelight.geometry.so3 import skew
-from lodelight.lights.conic import conic_centre, disc_axes, image_of_disc
+from lodelight.geometry.so3 import rotation_angle, skew, so3_exp
+from lodelight.lights.conic import conic_centre, image_of_disc
 from lodelight.lights.two_lights import poses_from_two_lights
 from lodelight.types import Array
 
 HUBER = 2.0  # sigmas of one light's two coordinates
 CHI2_2_99 = 9.21
 STEPS = 20
+NEAR_M, NEAR_RAD = 0.05, math.radians(2.0)  # far less than lies between the two poses of a flat ceiling
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +45,33 @@ class Views:
     up_cam: Array
     sigma_tilt_rad: float
 
-    @property
+    @cached_property
     def xyz(self) -> Array:
         return np.array([light.xyz for light in self.lights])
+
+    @cached_property
+    def normals(self) -> Array:
+        return np.array([light.normal for light in self.lights])
+
+    @cached_property
+    def radii_m(self) -> Array:
+        return np.array([light.radius_m for light in self.lights])
+
+    @cached_property
+    def survey_m2(self) -> Array:
+        return np.array([light.sigma_m**2 for light in self.lights])
+
+    @cached_property
+    def turns(self) -> Array:
+        """(N, 3, 3) how the camera has turned since its pose."""
+        return np.array([so3_exp(np.ascontiguousarray(w)) for w in self.moved[:, :3]])
+
+    @cached_property
+    def level_axes(self) -> Array:
+        """(2, 3): two horizontal unit vectors, camera frame."""
+        first = skew(self.up_cam)[:, int(np.argmin(np.abs(self.up_cam)))]
+        first = first / math.sqrt(first @ first)
+        return np.array([first, skew(self.up_cam) @ first])
 
     def of(self, keep: Sequence[int]) -> Views:
         rows = list(keep)
@@ -69,8 +95,20 @@ class Solution:
 
 def solve(views: Views) -> Solution | None:
     """The best pose over all starts; None where none is possible. At least two lights."""
-    found = [refined for start in _starts(views) if (refined := refine(start, views)) is not None]
+    found: list[Solution] = []
+    for start in _starts(views):
+        if any(_near(start, known.T_world_cam) for known in found):
+            continue
+        refined = refine(start, views)
+        if refined is not None:
+            found.append(refined)
     return min(found, key=lambda s: s.cost, default=None)
+
+
+def _near(a: SE3, b: SE3) -> bool:
+    """Whether a start lies where a solution has been found already."""
+    off_m = a.t - b.t
+    return bool(off_m @ off_m < NEAR_M**2 and rotation_angle(a.R.T @ b.R) < NEAR_RAD)
 
 
 def _starts(views: Views) -> list[SE3]:
@@ -81,8 +119,8 @@ def _starts(views: Views) -> list[SE3]:
     if n >= 3:
 
         def area(ijk: Iterable[int]) -> float:
-            a, b, c = views.rays[list(ijk)]
-            return float(np.linalg.norm(np.cross(b - a, c - a)))
+            (ax, ay), (bx, by), (cx, cy) = views.rays[list(ijk), :2]
+            return float(abs((bx - ax) * (cy - ay) - (by - ay) * (cx - ax)))
 
         rows = list(max(combinations(range(n), 3), key=area))
         unit = views.rays[rows] / np.linalg.norm(views.rays[rows], axis=1)[:, None]
@@ -124,45 +162,47 @@ def _unit_free(H: Array) -> Array:
 
 def misfits(T: SE3, views: Views) -> Array:
     """(N,) distance between each light's expected and measured centre, normalized coordinates."""
-    out = np.empty(len(views.lights))
-    for i, light in enumerate(views.lights):
-        seen = T.perturbed(views.moved[i])
-        out[i] = np.linalg.norm(_misfit(seen, light, views.rays[i])[1])
+    out: Array = np.linalg.norm(_seen(T, views)[2], axis=1)
     return out
 
 
-def _misfit(seen: SE3, light: Light, ray: Array) -> tuple[Array, Array]:
-    """The light in the camera (3,), and where its ellipse is centred less where it was measured (2,)."""
-    X = seen.R.T @ (light.xyz - seen.t)
-    return X, conic_centre(image_of_disc(X, seen.R.T @ light.normal, light.radius_m)) - ray[:2]
+def _seen(T: SE3, views: Views) -> tuple[Array, Array, Array]:
+    """R_world_cam (N, 3, 3) when each was seen, the lights there (N, 3), and (N, 2) of where their ellipses are
+    centred less where that was measured."""
+    R = T.R @ views.turns
+    X = np.einsum("nji,nj->ni", R, views.xyz - T.t - views.moved[:, 3:])
+    normals = np.einsum("nji,nj->ni", R, views.normals)
+    return R, X, conic_centre(image_of_disc(X, normals, views.radii_m)) - views.rays[:, :2]
 
 
 def _linearized(T: SE3, views: Views) -> tuple[Array, Array, float, Array, float] | None:
     """Normal matrix, gradient, robust cost, chi2 (N,) and tilt2 at a pose."""
-    H, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
-    chi2 = np.empty(len(views.lights))
-    for i, light in enumerate(views.lights):
-        seen = T.perturbed(views.moved[i])
-        X, r = _misfit(seen, light, views.rays[i])
-        if X[2] < 0.05:
-            return None
-        E = np.array([[1.0, 0.0, -X[0] / X[2]], [0.0, 1.0, -X[1] / X[2]]]) / X[2]
-        noise = views.sigma[i] ** 2 * np.eye(2) + light.sigma_m**2 * E @ E.T
-        J = np.hstack([E @ skew(X), -E @ seen.R.T])
-        W = np.linalg.inv(noise)
-        chi2[i] = r @ W @ r
-        k = math.sqrt(chi2[i])
-        weight = 1.0 if k <= HUBER else HUBER / k
-        cost += chi2[i] if k <= HUBER else 2.0 * HUBER * k - HUBER**2
-        H += weight * J.T @ W @ J
-        g += weight * J.T @ W @ r
+    R, X, r = _seen(T, views)
+    if (X[:, 2] < 0.05).any():
+        return None
+    n = len(X)
+    E = np.zeros((n, 2, 3))
+    E[:, 0, 0] = E[:, 1, 1] = 1.0 / X[:, 2]
+    E[:, :, 2] = -X[:, :2] / X[:, 2:] ** 2
+    noise = views.survey_m2[:, None, None] * (E @ E.transpose(0, 2, 1))
+    noise[:, (0, 1), (0, 1)] += views.sigma[:, None] ** 2
+    W = np.linalg.inv(noise)
+    J = np.empty((n, 2, 6))
+    J[:, :, :3] = E @ np.array([skew(x) for x in X])
+    J[:, :, 3:] = -E @ R.transpose(0, 2, 1)
+    Wr = np.einsum("nij,nj->ni", W, r)
+    chi2 = np.einsum("ni,ni->n", r, Wr)
+    k = np.sqrt(chi2)
+    weight = np.minimum(1.0, HUBER / np.maximum(k, 1e-12))
+    cost = float(np.where(k <= HUBER, chi2, 2.0 * HUBER * k - HUBER**2).sum())
+    WJ = weight[:, None, None] * (W @ J)
     up = T.R[2]
-    B = disc_axes(views.up_cam)
-    tilt = B @ up / views.sigma_tilt_rad
+    tilt = views.level_axes @ up / views.sigma_tilt_rad
     if up @ views.up_cam < 0.0:
         tilt = tilt + np.sign(tilt) * 2.0 / views.sigma_tilt_rad  # upside down is not level
-    J = np.hstack([B @ skew(up) / views.sigma_tilt_rad, np.zeros((2, 3))])
-    H += J.T @ J
-    g += J.T @ tilt
+    J_tilt = views.level_axes @ skew(up) / views.sigma_tilt_rad
+    H, g = np.einsum("nia,nib->ab", J, WJ), np.einsum("nia,ni->a", WJ, r)
+    H[:3, :3] += J_tilt.T @ J_tilt
+    g[:3] += J_tilt.T @ tilt
     tilt2 = float(tilt @ tilt)
     return H, g, cost + tilt2, chi2, tilt2
