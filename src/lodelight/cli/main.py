@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "tags": ("lodelight.cli.tags", "Printed tags: map where they hang, print them at true size."),
     "calibrate": ("lodelight.cli.calibrate", "Find a camera's lens from images of a printed tag board."),
-    "map": ("lodelight.cli.map", "Inspect, check and export saved maps."),
+    "map": ("lodelight.cli.map", "Inspect, check, export and merge saved maps."),
     "bench": ("lodelight.cli.bench", "Time and error over recordings on this machine: medians and ranges."),
 }
 

@@ -1,4 +1,4 @@
-"""`lodelight map info|check|export`."""
+"""`lodelight map info|check|export|merge`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
+    from lodelight.mapping.merge import Merged, Part
     from lodelight.types import Array
 
-app = typer.Typer(add_completion=False, help="Inspect, check and export saved maps.")
+app = typer.Typer(add_completion=False, help="Inspect, check, export and merge saved maps.")
 
 MAP = typer.Argument(..., metavar="MAP", help="Map file (map.lode) or the out folder of a run.")
 JSON = typer.Option(False, "--json", help="Print JSON.")
@@ -80,6 +81,75 @@ def export(
     else:
         told = to.export_cloud(map, out, format.value)
     print(json.dumps(told, indent=2) if as_json else "\n".join(f"{key:<12} {value}" for key, value in told.items()))
+
+
+@app.command(epilog="Example: lodelight map merge out/monday out/tuesday --out building.lode")
+def merge(
+    maps: list[Path] = typer.Argument(..., metavar="MAP...", help="Map files or out folders; only read."),
+    out: Path = typer.Option(..., help="Map file to write."),
+    as_json: bool = JSON,
+) -> None:
+    """Make one map of several of one building, by tags and places that they share, and adjust it as a whole."""
+    from lodelight.errors import RunError
+    from lodelight.mapping.merge import merged
+    from lodelight.mapping.store import load_map, save_map
+
+    files = [_file(path) for path in maps]
+    _check_merge(files, out)
+    together = merged([load_map(path) for path in files], on_part=lambda i, part: _progress(files[i], part))
+    left_out = [(path, part.why) for path, part in zip(files, together.parts, strict=True) if not part.by]
+    if len(left_out) < len(files) - 1:
+        save_map(together.map, out, {"merged": ", ".join(sorted(str(p) for p in files if p not in dict(left_out)))})
+        told = _merged(files, together) | {"out": str(out)}
+        print(json.dumps(told, indent=2) if as_json else _merged_text(told))
+    if left_out:
+        kept = f"the others are in {out}" if len(left_out) < len(files) - 1 else "nothing was written"
+        raise RunError("; ".join(f"{path} was left out: {why}" for path, why in left_out) + f"; {kept}")
+
+
+def _check_merge(files: list[Path], out: Path) -> None:
+    from lodelight.errors import MapError
+
+    if len(files) < 2:
+        raise typer.BadParameter("name at least two maps.")
+    resolved = [path.resolve() for path in files]
+    if len(set(resolved)) < len(files):
+        raise typer.BadParameter("a map is named twice.")
+    if out.resolve() in resolved:
+        raise MapError(f"--out {out} is one of the maps; merging never changes those, choose another name")
+
+
+def _progress(path: Path, part: Part) -> None:
+    import sys
+
+    if sys.stderr.isatty():
+        print(f"{path}: {f'joined by {part.by}' if part.by else f'left out, {part.why}'}", file=sys.stderr)
+
+
+def _merged(files: list[Path], together: Merged) -> dict[str, Any]:
+    parts = [
+        {
+            "map": str(path), "by": part.by, "why": part.why, "keyframes": part.keyframes[1] - part.keyframes[0],
+            "pairs": part.pairs, "tags": list(part.tags), "shared_points": together.shared_points(i),
+        }
+        for i, (path, part) in enumerate(zip(files, together.parts, strict=True))
+    ]  # fmt: skip
+    return {
+        "parts": parts, "keyframes": len(together.map.keyframes), "points": len(together.map.points),
+        "loops": len(together.map.loops), "tags": int(together.map.tags.placed.sum()),
+    }  # fmt: skip
+
+
+def _merged_text(told: dict[str, Any]) -> str:
+    lines = []
+    for part in told["parts"]:
+        how = {"base": "the base", "": f"left out: {part['why']}"}.get(part["by"], f"by {part['by']}")
+        agree = f" ({part['pairs']} places, {len(part['tags'])} tags agree)" if part["by"] not in ("", "base") else ""
+        count = f", {part['keyframes']} keyframes, {part['shared_points']} points shared" if part["by"] else ""
+        lines.append(f"{part['map']}: {how}{agree}{count}")
+    return "\n".join(
+        [*lines, f"{told['out']}: {told['keyframes']} keyframes, {told['points']} points, {told['tags']} tags"]
+    )
 
 
 def _file(path: Path) -> Path:

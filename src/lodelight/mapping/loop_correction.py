@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lodelight.estimation.posegraph import PoseGraph, optimize_pose_graph
+from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.local import adjust, fuse_into
 from lodelight.mapping.map import Map
@@ -43,16 +44,12 @@ def correct_loop(
     with map.lock:
         here = verifier.neighbourhood(loop.a, size=FUSED_KEYFRAMES)  # while they are not neighbours yet
         there = verifier.neighbourhood(loop.b, size=FUSED_KEYFRAMES)
-        moved_m = _spread_error(map, loop, verifier.sigma_px / verifier.camera.focal_px) if drifted else 0.0
+        moved_m = spread_error(map, [loop], verifier.sigma_px / verifier.camera.focal_px) if drifted else 0.0
         map.loops.append(1, a=loop.a, b=loop.b, R=loop.T_a_b.R, p=loop.T_a_b.t)
         n_points = np.count_nonzero(map.points.alive)
-        _unite(map, loop)
-        points = points_of_keyframes(map, there)
-        for keyframe in here:
-            points = np.unique(map.surviving(points))
-            fuse_into(map, int(keyframe), points[points >= 0], orb, FUSE_PX)
+        unite(map, loop)
+        fuse_doubles(map, here, there, orb)
         fused = int(n_points - np.count_nonzero(map.points.alive))
-        map.refresh_points(points_of_keyframes(map, here), orb.scale_factor, orb.n_levels)
         before = map.keyframes.R.copy(), map.keyframes.p.copy()
         everything = map.alive_keyframes
     if drifted:
@@ -65,8 +62,8 @@ def correct_loop(
 # -- the pose graph -------------------------------------------------------------------------------------------------
 
 
-def _spread_error(map: Map, loop: Pair, sigma_rad: float) -> float:
-    """Optimize the pose graph with the new loop and move the points along; returns how far keyframes moved, m."""
+def spread_error(map: Map, loops: Sequence[Pair], sigma_rad: float) -> float:
+    """Optimize the pose graph with the new loops and move the points along; returns how far keyframes moved, m."""
     keyframes = map.alive_keyframes
     R, p = map.keyframes.R[keyframes], map.keyframes.p[keyframes]
     a, b, n_shared = present_edges(map, keyframes)
@@ -75,14 +72,15 @@ def _spread_error(map: Map, loop: Pair, sigma_rad: float) -> float:
     row = np.full(len(map.keyframes), -1)
     row[keyframes] = np.arange(len(keyframes))
     closed = np.flatnonzero(map.keyframes.alive[map.loops.a] & map.keyframes.alive[map.loops.b])
-    a = np.concatenate([a, row[map.loops.a[closed]], row[[loop.a]]])
-    b = np.concatenate([b, row[map.loops.b[closed]], row[[loop.b]]])
-    n_shared = np.concatenate([n_shared, np.full(len(closed) + 1, loop.inliers)])
+    a = np.concatenate([a, row[map.loops.a[closed]], row[[loop.a for loop in loops]]])
+    b = np.concatenate([b, row[map.loops.b[closed]], row[[loop.b for loop in loops]]])
+    inliers = np.array([loop.inliers for loop in loops])
+    n_shared = np.concatenate([n_shared, np.full(len(closed), inliers.min()), inliers])
     depth_m = np.array([median_distance(map, int(k)) for k in keyframes])
     graph = PoseGraph(
         R, p, map.keyframes.parent[keyframes] < 0, a, b,
-        np.concatenate([R_ab, map.loops.R[closed], loop.T_a_b.R[None]]),
-        np.concatenate([p_ab, map.loops.p[closed], loop.T_a_b.t[None]]),
+        np.concatenate([R_ab, map.loops.R[closed], [loop.T_a_b.R for loop in loops]]),
+        np.concatenate([p_ab, map.loops.p[closed], [loop.T_a_b.t for loop in loops]]),
         edge_information(n_shared, depth_m[a], sigma_rad),
     )  # fmt: skip
     result = optimize_pose_graph(graph)
@@ -139,7 +137,16 @@ def move_points(map: Map, keyframes: Ints, R_old: Array, p_old: Array, R_new: Ar
 # -- what was double ------------------------------------------------------------------------------------------------
 
 
-def _unite(map: Map, loop: Pair) -> None:
+def fuse_doubles(map: Map, here: Ints, there: Ints, orb: OrbConfig) -> None:
+    """Look for the points of keyframes `there` in the images of those `here`."""
+    points = points_of_keyframes(map, there)
+    for keyframe in here:
+        points = np.unique(map.surviving(points))
+        fuse_into(map, int(keyframe), points[points >= 0], orb, FUSE_PX)
+    map.refresh_points(points_of_keyframes(map, here), orb.scale_factor, orb.n_levels)
+
+
+def unite(map: Map, loop: Pair) -> None:
     """The verified matches of either direction become observations of one point."""
     for keyframe, located in ((loop.a, loop.there), (loop.b, loop.back)):
         rows = map.feature_range(keyframe).start + located.feature
