@@ -9,7 +9,7 @@ SRC = Path(__file__).parents[1] / "src"
 LAYERS = [
     ["__main__"],
     ["cli"],
-    ["slam", "localizer", "doctor"],
+    ["slam", "localizer", "doctor", "fleet"],
     ["inertial"],
     ["localization"],
     ["mapping", "odometry"],

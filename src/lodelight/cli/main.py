@@ -34,6 +34,10 @@ COMMANDS = {
     "tags": ("lodelight.cli.tags", "Printed tags: map where they hang, print them at true size."),
     "calibrate": ("lodelight.cli.calibrate", "Find a camera's lens from images of a printed tag board."),
     "map": ("lodelight.cli.map", "Inspect, check, export and merge saved maps."),
+    "fleet": (
+        "lodelight.cli.fleet",
+        "SLAM over many recordings of one building, here or on a cluster, and one map of them all.",
+    ),
     "bench": ("lodelight.cli.bench", "Time and error over recordings on this machine: medians and ranges."),
 }
 

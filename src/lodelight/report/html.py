@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -19,6 +20,7 @@ from lodelight.report.folder import RunFolder, read_folder
 from lodelight.trajectory import Trajectory
 
 MAX_EVENTS_OF_A_KIND = 400
+_PAGE = files("lodelight.report") / "page"
 
 
 def write_report(out: Path, truth: Trajectory | None, mode: Mode = "se3") -> Path:
@@ -26,28 +28,37 @@ def write_report(out: Path, truth: Trajectory | None, mode: Mode = "se3") -> Pat
 
     Raises SourceError where the folder is not complete or cannot be written.
     """
-    from plotly.offline import get_plotlyjs
-
     run = read_folder(out, truth, mode)
     plots = _plots(run)
     events, events_note = _events(run)
+    tail = Template((_PAGE / "events.html").read_text(encoding="utf-8")).substitute(
+        events_note=events_note, config=html.escape(read_text(out / "config.toml"))
+    )
+    sections = [section(name, *plot[:3]) for name, plot in plots.items()]
     data = {"figures": {name: figure for name, (_, _, _, figure) in plots.items()}, "events": events}
-    page = files("lodelight.report") / "page"
-    document = Template((page / "page.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(run.name),
-        lead=_lead(run),
-        cards="\n".join(_cards(run.metrics)),
-        plots="\n".join(_section(name, *plot[:3]) for name, plot in plots.items()),
-        events_note=events_note,
-        config=html.escape(read_text(out / "config.toml")),
-        css=(page / "page.css").read_text(encoding="utf-8"),
-        js=(page / "page.js").read_text(encoding="utf-8"),
+    return write_page(out / "report.html", run.name, _lead(run), _cards(run.metrics), sections, tail, data)
+
+
+def write_page(
+    path: Path, title: str, lead: str, cards: Sequence[str], sections: Sequence[str], tail: str, data: dict[str, Any]
+) -> Path:
+    """One page with everything inside. data : figures by the name of their section, and events to list."""
+    from plotly.offline import get_plotlyjs
+
+    document = Template((_PAGE / "page.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(title),
+        lead=html.escape(lead),
+        cards="\n".join(cards),
+        plots="\n".join(sections),
+        tail=tail,
+        css=(_PAGE / "page.css").read_text(encoding="utf-8"),
+        js=(_PAGE / "page.js").read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
         # a text in the data must not end the script that holds it
         data=json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
     )
-    write_text(out / "report.html", document)
-    return out / "report.html"
+    write_text(path, document)
+    return path
 
 
 def _plots(run: RunFolder) -> dict[str, tuple[str, str, bool, Figure]]:
@@ -75,7 +86,7 @@ def _plots(run: RunFolder) -> dict[str, tuple[str, str, bool, Figure]]:
     return drawn
 
 
-def _section(name: str, title: str, note: str, wide: bool) -> str:
+def section(name: str, title: str, note: str, wide: bool) -> str:
     below = f'<p class="note">{html.escape(note)}</p>' if note else ""
     height = {"states": ' style="height:110px"', "map": ' style="height:560px"'}.get(name, "")
     kind = ' class="wide"' if wide else ""
@@ -95,33 +106,33 @@ def _cards(m: dict[str, Any]) -> list[str]:
     final, live = (m["ate"] or {}).get("final"), (m["ate"] or {}).get("live")
     if final:
         more = f"rotation {final['rotation_deg']:.2f}°, {final['align']} aligned"
-        cards.append(_card("Error (ATE RMSE)", f"{100 * final['rmse_m']:.2f} cm", more))
+        cards.append(card("Error (ATE RMSE)", f"{100 * final['rmse_m']:.2f} cm", more))
     if live:
         more = f"as known at the time; p95 {100 * live['p95_m']:.2f} cm"
-        cards.append(_card("Live error", f"{100 * live['rmse_m']:.2f} cm", more))
+        cards.append(card("Live error", f"{100 * live['rmse_m']:.2f} cm", more))
     lost = m["states"]["lost"]
-    cards.append(_card("Tracked", f"{100 * m['tracked_fraction']:.1f} %", f"lost {100 * lost:.1f} % of the frames"))
+    cards.append(card("Tracked", f"{100 * m['tracked_fraction']:.1f} %", f"lost {100 * lost:.1f} % of the frames"))
     ms = m["ms_per_frame"]
     if ms["p50"] is not None:
         more = f"mean {ms['mean']:.1f} · p95 {ms['p95']:.1f} · p99 {ms['p99']:.1f}"
-        cards.append(_card("Per frame, median", f"{ms['p50']:.1f} ms", more))
+        cards.append(card("Per frame, median", f"{ms['p50']:.1f} ms", more))
     if m["real_time_factor"] is not None:
-        cards.append(_card("Real-time factor", f"{m['real_time_factor']:.2f}", "mapping counted in; below 1 keeps up"))
+        cards.append(card("Real-time factor", f"{m['real_time_factor']:.2f}", "mapping counted in; below 1 keeps up"))
     more = f"keyframes {m['keyframes']:,} · loops {m['loops']} · relocalizations {m['relocalizations']}"
-    cards.append(_card("Map points", f"{m['map_points']:,}", more))
+    cards.append(card("Map points", f"{m['map_points']:,}", more))
     if any(m["gate"].values()):
         more = f"{m['gate']['veto']} vetoed · {m['gate']['abstain']} unverified"
-        cards.append(_card("Keyframes the gate passed", f"{m['gate']['pass']}", more))
+        cards.append(card("Keyframes the gate passed", f"{m['gate']['pass']}", more))
     if m["temporary_points"]["created"]:
         cards.append(
-            _card("Temporary points", f"{m['temporary_points']['created']:,}", f"{m['temporary_points']['left']} left")
+            card("Temporary points", f"{m['temporary_points']['created']:,}", f"{m['temporary_points']['left']} left")
         )
     if m["peak_rss_mb"] is not None:
-        cards.append(_card("Peak memory", f"{m['peak_rss_mb']:.0f} MB", f"compiling took {m['compile_s']:.1f} s"))
+        cards.append(card("Peak memory", f"{m['peak_rss_mb']:.0f} MB", f"compiling took {m['compile_s']:.1f} s"))
     return cards
 
 
-def _card(label: str, value: str, more: str) -> str:
+def card(label: str, value: str, more: str) -> str:
     parts = (("label", label), ("value", value), ("more", more))
     inner = "".join(f'<div class="{name}">{html.escape(text)}</div>' for name, text in parts)
     return f'<div class="card">{inner}</div>'

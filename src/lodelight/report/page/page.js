@@ -52,30 +52,33 @@ for (const plot of timed) {
   });
 }
 
-const body = document.querySelector("#events tbody");
-const kinds = [...new Set(data.events.map((event) => event.kind))];
-const hidden = new Set(kinds.filter((kind) => kind.endsWith("(none)")));
-const words = document.getElementById("words");
-function list() {
-  const wanted = words.value.toLowerCase();
-  const rows = data.events.filter((event) =>
-    !hidden.has(event.kind) && (event.kind + " " + event.what).toLowerCase().includes(wanted));
-  body.replaceChildren(...rows.map((event) => {
-    const row = document.createElement("tr");
-    for (const text of [event.t_s.toFixed(2), event.kind, event.what]) row.insertCell().textContent = text;
-    return row;
-  }));
-}
-for (const kind of kinds) {
-  const button = document.createElement("button");
-  button.textContent = kind;
-  button.setAttribute("aria-pressed", String(!hidden.has(kind)));
-  button.onclick = () => {
-    hidden.has(kind) ? hidden.delete(kind) : hidden.add(kind);
+function listEvents(events) {
+  const body = document.querySelector("#events tbody");
+  const kinds = [...new Set(events.map((event) => event.kind))];
+  const hidden = new Set(kinds.filter((kind) => kind.endsWith("(none)")));
+  const words = document.getElementById("words");
+  function list() {
+    const wanted = words.value.toLowerCase();
+    const rows = events.filter((event) =>
+      !hidden.has(event.kind) && (event.kind + " " + event.what).toLowerCase().includes(wanted));
+    body.replaceChildren(...rows.map((event) => {
+      const row = document.createElement("tr");
+      for (const text of [event.t_s.toFixed(2), event.kind, event.what]) row.insertCell().textContent = text;
+      return row;
+    }));
+  }
+  for (const kind of kinds) {
+    const button = document.createElement("button");
+    button.textContent = kind;
     button.setAttribute("aria-pressed", String(!hidden.has(kind)));
-    list();
-  };
-  document.getElementById("kinds").append(button);
+    button.onclick = () => {
+      hidden.has(kind) ? hidden.delete(kind) : hidden.add(kind);
+      button.setAttribute("aria-pressed", String(!hidden.has(kind)));
+      list();
+    };
+    document.getElementById("kinds").append(button);
+  }
+  words.oninput = list;
+  list();
 }
-words.oninput = list;
-list();
+if (data.events) listEvents(data.events);

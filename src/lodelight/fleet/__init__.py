@@ -1,0 +1,1 @@
+"""Many recordings of one building: a run for each, wherever there is a processor, then one map of them all."""
