@@ -51,14 +51,16 @@ def _cards(told: dict[str, Any]) -> list[str]:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     head = "".join(f"<th>{name}</th>" for name in HEAD)
-    body = "".join(
-        f"<tr>{''.join(f'<td>{html.escape(cell).replace(" %", "&nbsp;%").replace(" cm", "&nbsp;cm")}</td>' for cell in _cells(row))}</tr>"
-        for row in rows
-    )
+    body = "".join(f"<tr>{''.join(f'<td>{_held(cell)}</td>' for cell in _cells(row))}</tr>" for row in rows)
     return (
         f'<section class="wide"><h2>Recordings</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div></section>"
     )
+
+
+def _held(text: str) -> str:
+    """As HTML, with numbers and their units in one line."""
+    return html.escape(text).replace(" %", "&nbsp;%").replace(" cm", "&nbsp;cm")
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
