@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from lodelight.cli.options import RRD_HELP, VIEW_HELP, WEB_HELP
+
 if TYPE_CHECKING:
+    from lodelight.cli.watching import Watcher
     from lodelight.io.recording import Recording
     from lodelight.localizer import LocalizerConfig
     from lodelight.mapping.map import Map
@@ -32,11 +35,15 @@ def localize(
     end: float = typer.Option(float("inf"), help="Seconds after the first frame."),
     seed: int = typer.Option(0, help="Seed of every random draw."),
     settings: list[str] = typer.Option([], "--set", help="section.key=value, as ladder.states.good_inliers=80."),
+    view: bool = typer.Option(False, "--view", help=VIEW_HELP),
+    web: bool = typer.Option(False, "--web", help=WEB_HELP),
+    rrd: Path = typer.Option(None, "--rrd", help=RRD_HELP),
     as_json: bool = typer.Option(False, "--json", help="Print metrics.json."),
 ) -> None:
     """Find and follow a camera in a saved map, which is never changed."""
     from lodelight.cli.map import _file
     from lodelight.cli.run import _summary
+    from lodelight.cli.watching import ViewOptions
     from lodelight.errors import ConfigError, RunError
     from lodelight.io.sources import open_source
     from lodelight.localizer import LocalizerConfig
@@ -54,8 +61,11 @@ def localize(
         temporary_points=temporary_points,
     )
     config = with_settings(wanted, settings)
-    metrics = localize_to_folder(recording, out, config, known, map_file, live, start, end)
-    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out))
+    watcher = ViewOptions(view, web, rrd).watcher(recording)
+    metrics = localize_to_folder(recording, out, config, known, map_file, live, start, end, watcher)
+    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out), flush=True)
+    if watcher:
+        watcher.stay()
     if metrics["tracked_fraction"] == 0.0:
         raise RunError(f"{source}: no frame was found in the map; {out / 'events.jsonl'} says why")
 
@@ -69,8 +79,12 @@ def localize_to_folder(
     live: bool = False,
     start_s: float = 0.0,
     end_s: float = float("inf"),
+    watcher: Watcher | None = None,
 ) -> dict[str, Any]:
-    """Localize a recording in a map and write the out folder; returns what `metrics.json` holds."""
+    """Localize a recording in a map and write the out folder; returns what `metrics.json` holds.
+
+    watcher : shows it while it goes on
+    """
     import cv2
 
     from lodelight.cli.progress import track
@@ -85,14 +99,19 @@ def localize_to_folder(
     begun_s, compiled_s = time.perf_counter(), compile_seconds()
     localizer = Localizer(recording.rig, known, config, live=live)
     with Outputs(out, {"localize": asked, **as_table(config)}) as outputs:
-        localizer.on_event = outputs.event
+        localizer.on_event = watcher.events(outputs.event) if watcher else outputs.event
+        source = watcher.of(recording) if watcher else recording
         poses, first_ns, last_ns = [], None, 0
-        for estimate in track(localizer.run(recording, start_s, end_s), "localizing", recording.n_frames):
+        for estimate in track(localizer.run(source, start_s, end_s), "localizing", recording.n_frames):
             details = dict(estimate.details)
             outputs.frame(estimate, details.pop("track_ms"), 0.0, **details)
             first_ns, last_ns = first_ns or estimate.t_ns, estimate.t_ns
             if estimate.localized:
                 poses.append((estimate.t_ns, estimate.T_world_body))
+            if watcher:
+                watcher.show(estimate, localizer)
+        if watcher:
+            watcher.finish(localizer)
         wall_s = time.perf_counter() - begun_s
         for skipped in recording.skipped:
             outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)

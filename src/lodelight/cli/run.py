@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from lodelight.cli.options import TOPIC_HELP
+from lodelight.cli.options import RRD_HELP, TOPIC_HELP, VIEW_HELP, WEB_HELP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from lodelight.anchors import Anchors
+    from lodelight.cli.watching import Watcher
     from lodelight.io.recording import Recording
     from lodelight.mapping.map import Map
     from lodelight.messages import LightFix
@@ -43,9 +44,13 @@ def run(
     seed: int = typer.Option(0, help="Seed of every random draw."),
     settings: list[str] = typer.Option([], "--set", help="section.key=value, for example mapping.window=30."),
     topic: list[str] = typer.Option([], "--topic", help=TOPIC_HELP),
+    view: bool = typer.Option(False, "--view", help=VIEW_HELP),
+    web: bool = typer.Option(False, "--web", help=WEB_HELP),
+    rrd: Path = typer.Option(None, "--rrd", help=RRD_HELP),
     as_json: bool = typer.Option(False, "--json", help="Print metrics.json."),
 ) -> None:
     """SLAM over a recording: trajectory, map and report."""
+    from lodelight.cli.watching import ViewOptions
     from lodelight.errors import ConfigError, RunError
     from lodelight.io.anchors_toml import read_anchors
     from lodelight.io.rosbag_topics import parse_roles
@@ -66,8 +71,11 @@ def run(
         fixes = light_fixes(recording, again, surveyed, light_odometry, light_frame, start, end)
     elif light_odometry:
         raise ConfigError("--light-odometry is used by the gate; add --gate lights")
-    metrics = slam_to_folder(recording, out, config, known, live, start, end, surveyed, fixes)
-    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out))
+    watcher = ViewOptions(view, web, rrd).watcher(recording, surveyed)
+    metrics = slam_to_folder(recording, out, config, known, live, start, end, surveyed, fixes, watcher)
+    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out), flush=True)
+    if watcher:
+        watcher.stay()
     if metrics["tracked_fraction"] == 0.0:
         raise RunError(f"{source}: no frame could be localized; {out / 'events.jsonl'} says why")
 
@@ -101,11 +109,13 @@ def slam_to_folder(
     end_s: float = float("inf"),
     anchors: Anchors | None = None,
     fixes: Iterable[LightFix] = (),
+    watcher: Watcher | None = None,
 ) -> dict[str, Any]:
     """Run SLAM over a recording and write the out folder; returns what `metrics.json` holds.
 
     known : a loaded map to continue; live : paced by the stamps
     fixes : what lights say, by rising stamp; the config says what is made of it
+    watcher : shows it while it goes on
     """
     import cv2
 
@@ -122,12 +132,18 @@ def slam_to_folder(
     asked = {"source": str(recording.path), "live": live, "start_s": start_s, "map": known is not None}
     with Outputs(out, {"run": asked, **as_table(config)}) as outputs, stopped_by_interrupt(recording):
         begun_s, compiled_s = time.perf_counter(), compile_seconds()
-        slam = Slam(recording.rig, config, map=known, on_event=outputs.event, live=live, anchors=anchors)
+        told = watcher.events(outputs.event) if watcher else outputs.event
+        slam = Slam(recording.rig, config, map=known, on_event=told, live=live, anchors=anchors)
         mapped, first_ns, last_ns = 0, None, 0
-        for estimate in track(slam.run(recording, start_s, end_s, fixes), "SLAM", recording.n_frames or None):
+        source, fixes = (watcher.of(recording), watcher.lights(fixes)) if watcher else (recording, fixes)
+        for estimate in track(slam.run(source, start_s, end_s, fixes), "SLAM", recording.n_frames or None):
             outputs.frame(estimate, estimate.details["track_ms"], sum(slam.mapping_ms[mapped:]))
             mapped = len(slam.mapping_ms)
             first_ns, last_ns = first_ns or estimate.t_ns, estimate.t_ns
+            if watcher:
+                watcher.show(estimate, slam)
+        if watcher:
+            watcher.finish(slam)
         wall_s = time.perf_counter() - begun_s
         for skipped in recording.skipped:
             outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)

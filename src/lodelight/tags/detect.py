@@ -75,7 +75,7 @@ class _Read:
 class TagDetector:
     """Finds the tags of given families in the images of one camera, in the order they come.
 
-    camera : its lens; refused : what the last image had that is not used
+    camera : its lens; seen : in the last image; refused : what it had that is not used
     Raises ConfigError on an unknown family.
     """
 
@@ -90,7 +90,7 @@ class TagDetector:
             raise ConfigError(f"tag family {unknown[0]!r} is unknown; choose qr or one of {', '.join(FAMILIES)}")
         self.refused: list[Refused] = []
         self._count = 0
-        self._seen: list[TagSighting] = []
+        self.seen: list[TagSighting] = []
 
     def detect(self, image: Bytes, t_ns: int, thorough: bool = False) -> list[TagSighting]:
         """Sightings in an image (H, W) uint8, at most one of each place; by family, then id, then position.
@@ -110,7 +110,7 @@ class TagDetector:
             elif refusal:
                 self._refuse(f"{read.family} {read.id}", refusal)
         sightings.sort(key=lambda s: (s.family, s.id, s.corners_px[0, 0], s.corners_px[0, 1]))
-        self._seen = sightings
+        self.seen = sightings
         return sightings
 
     # -- reading ------------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ class TagDetector:
             if everywhere:
                 chops = [(0, 0, image)]
             else:
-                chops = [self._chop(image, s.corners_px) for s in self._seen if s.family == family]
+                chops = [self._chop(image, s.corners_px) for s in self.seen if s.family == family]
             for left, top, part in chops:
                 for quad in _read_squares(part, family, self.config.decimate if everywhere else 1.0):
                     number = quad.number
