@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from lodelight.estimation.pose import PoseResult
 from lodelight.features.features import Features
 from lodelight.features.matching import FeatureIndex
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
+from lodelight.localization.influence import MOST, leverage
 from lodelight.localization.temporary import TemporaryPoints
 from lodelight.localization.tracker import Landmarks, Tracked, Tracker, TrackerConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import in_sight, keyframes_near, local_keyframes, points_of_keyframes
 from lodelight.rig import Rig
-from lodelight.types import Ints
+from lodelight.types import Array, Ints
 
 FIRST_TEMPORARY = -2
 ENOUGH_VOTES = 30  # matches with the map, from which its own covisibility says best what is around
+MOST_DECIDING = 5  # points that decide a pose alone, in one frame
 NEAR_M, NEAR_DEG, NEAREST = 8.0, 60.0, 20  # else keyframes from so near, turned by so little, at most so many
 
 
@@ -85,7 +88,7 @@ class Follower(Tracker):
         xyz[of_map] = map.points.xyz[mapped[used[of_map]]]
         xyz[~of_map] = overlay.xyz[carried[used[~of_map]]]
         weight = np.where(of_map, 1.0, self.temporary.config.weight)
-        solved, noise = self._solve(T_world_body, seen.take(used), xyz, weight)
+        solved, noise = self._solve_without_leverage(T_world_body, seen.take(used), xyz, weight)
         wrong = used[~solved.inliers]
         mapped[wrong], carried[wrong] = -1, -1
         if use_overlay:
@@ -97,6 +100,23 @@ class Follower(Tracker):
         if solved.n_inliers < self.config.min_inliers:
             tracked.why_lost = f"{solved.n_inliers} of {len(used)} matches with the local map are inliers"
         return tracked
+
+    def _solve_without_leverage(
+        self, start: SE3, seen: Features, xyz: Array, weight: Array
+    ) -> tuple[PoseResult, float]:
+        """As `_solve`, by points of which none decides by itself: those are only tested at the end."""
+        weight = weight.copy()
+        for _ in range(MOST_DECIDING):
+            solved, noise = self._solve(start, seen, xyz, weight)
+            held = leverage(
+                solved.T_world_body, self.T_body_cam, self.camera, xyz, seen.px, noise * self._sigma_px(seen),
+                seen.inv_depth, noise * seen.sigma_inv_depth, np.where(solved.inliers, weight, 0.0),
+            )  # fmt: skip
+            most = int(np.argmax(held)) if len(held) else 0
+            if not len(held) or held[most] <= MOST:
+                break
+            weight[most] = 0.0
+        return solved, noise
 
     def _around(self, T_world_body: SE3, point: Ints) -> Ints:
         """Keyframes whose points make the local map: those that see what the frame sees, and where that is little,
