@@ -118,26 +118,47 @@ def blocks(given: argparse.Namespace) -> None:
     odd = [(i // given.length) % 2 == 1 for i in range(len(frames))]
     slam = mapped(recording, [f for f, query in zip(frames, odd, strict=True) if not query], "rgbd")
     queries = [f for f, query in zip(frames, odd, strict=True) if query]
-    truth = recording.ground_truth()
-    truth = replace(truth, t_ns=truth.t_ns + round(1e6 * given.truth_late_ms))
-    T_map_truth = T_map_truth_of(slam.trajectory(), truth)
-    if given.against_slam:  # where RGB-D SLAM over all frames puts them, both paths laid on one another
-        whole = mapped(recording, frames, "rgbd")
-        truth = whole.trajectory()
-        T_map_truth = T_map_truth_of(slam.trajectory(), truth)
     run = Query(recording.rig, slam.map, queries, given)
     print(f"{recording.name}: map of {slam.stats()['keyframes']} keyframes; {run.told()}")
-    off, turn, status = run.errors(T_map_truth, truth)
+    if given.against_slam:  # where RGB-D SLAM over all frames puts them, both paths laid on one another
+        against(run, slam.trajectory(), mapped(recording, frames, "rgbd").trajectory())
+    else:
+        truth = recording.ground_truth()
+        against(run, slam.trajectory(), truth)
+        late_ms = clock_offset_ms(slam.trajectory(), truth)
+        print(f"with the truth's clock {late_ms:.0f} ms later, where the path of the map itself fits it best:")
+        against(run, slam.trajectory(), later(truth, late_ms))
+    if given.verbose:
+        for e in run.estimates:
+            print(e.t_ns, e.status, e.inliers, int(e.details["temporary"]), e.why)
+        print(*run.events, sep="\n")
+
+
+def later(truth: Trajectory, ms: float) -> Trajectory:
+    return replace(truth, t_ns=truth.t_ns + round(1e6 * ms))
+
+
+def clock_offset_ms(path: Trajectory, truth: Trajectory) -> float:
+    """By how much the truth's stamps are to be raised for the attitudes of a path to fit it best."""
+
+    def misfit(ms: float) -> float:
+        moved = later(truth, ms)
+        T = T_map_truth_of(path, moved)
+        turns = [(T @ truth_at(moved, int(t))).inverse() @ path.pose(i) for i, t in enumerate(path.t_ns)]
+        return float(np.mean([turn.angle**2 for turn in turns]))
+
+    return min(np.arange(-50.0, 51.0, 2.0), key=misfit)
+
+
+def against(run: Query, path: Trajectory, truth: Trajectory) -> None:
+    """Print the errors of a run. path : of the run that made the map, to lay the map's frame on the truth's"""
+    off, turn, status = run.errors(T_map_truth_of(path, truth), truth)
     for metres, degrees in ((0.03, 1.0), (0.05, 2.0), (0.10, 2.0), (0.25, 2.0)):
         within = np.count_nonzero((off <= metres) & (turn <= degrees)) / len(run.estimates)
         print(f"  within {metres} m, {degrees} deg: {within:.1%} of all queries")
     tracking = np.array([s == "tracking" for s in status])
     print(f"  median {np.median(off):.4f} m {np.median(turn):.3f} deg, largest {off.max():.3f} m {turn.max():.2f} deg")
     print(f"  largest while it says tracking: {off[tracking].max(initial=0.0):.3f} m")
-    if given.verbose:
-        for e in run.estimates:
-            print(e.t_ns, e.status, e.inliers, int(e.details["temporary"]), e.why)
-        print(*run.events, sep="\n")
 
 
 def pair(given: argparse.Namespace) -> None:
@@ -286,7 +307,6 @@ def main() -> None:
     parser = task("blocks", blocks, "recording")
     parser.add_argument("--length", type=int, default=30)
     parser.add_argument("--against-slam", action="store_true", help="not the truth, but SLAM over all frames")
-    parser.add_argument("--truth-late-ms", type=float, default=0.0, help="clock of the truth, against the images'")
     task("pair", pair, "run", "recording", "query").add_argument("--end", type=float, default=float("inf"))
     parser = task("wrong", wrong, "run", "recording", "query")
     parser.add_argument("others", type=Path, nargs="*")

@@ -100,15 +100,17 @@ def test_the_turn_is_read_from_the_rows_with_the_pose_unknown(seed):
     off = SE3.exp(rng.normal(0, [0.01] * 3 + [0.01] * 3))
     found, seen = np.zeros(6), seen_as(rolling.camera, px, 1.0 / xyz[:, 2])
     for _ in range(3):
-        more = rolling.turn_left_over(seen.px, np.full(len(px), 0.7), off @ xyz)
+        more = np.zeros(6)
+        more[:3] = rolling.turn_left_over(seen.px, np.full(len(px), 0.7), off @ xyz, -found[:3], 10.0 * np.eye(3))
         found, seen = found + more, rolling.straightened(seen, more)
     # 0.7 px over 250 corners against 14 ms and 400 px: 0.03 rad/s, half more about the axis, thrice that
     # and what the velocity takes over
     np.testing.assert_allclose(found[:3], twist[:3], atol=0.2)
 
 
-def test_few_corners_say_nothing_of_the_turn():
+def test_few_corners_leave_the_turn_at_what_is_known_without_them():
     rolling, xyz = shutter(), points(np.random.default_rng(3), 3)
     px, _ = rolling.camera.project(xyz)
-    turn = rolling.turn_left_over(px + np.array([3.0, 0.0]), np.ones(3), xyz)
-    assert np.abs(turn).max() < 0.1
+    known = np.array([0.3, -0.2, 0.1])
+    turn = rolling.turn_left_over(px + np.array([3.0, 0.0]), np.ones(3), xyz, known, np.eye(3))
+    assert np.abs(turn - known).max() < 0.1

@@ -19,7 +19,6 @@ from lodelight.types import AnyArray, Array
 STILL = np.zeros(6)
 BEYOND = 0.1  # of the image's width: so far outside of it a straightened corner may lie, as the first row never saw it
 STEP = 1e-4  # rad or m, of the central differences
-UNKNOWN_TURN = 1.0  # rad/s: how far a turn can be from the one before
 UNMEASURED = 1e-6  # information that keeps the system solvable where corners leave a direction open
 
 
@@ -33,6 +32,10 @@ class Shutter:
     @property
     def rolls(self) -> bool:
         return self.row_time_s > 0.0
+
+    @property
+    def readout_s(self) -> float:
+        return self.row_time_s * self.camera.height
 
     def straightened(self, seen: Features, twist: Array) -> Features:
         """Corners as they would be at the stamp, some of them past the image's rim (see BEYOND).
@@ -54,24 +57,29 @@ class Shutter:
             sigma_inv_depth=(seen.sigma_inv_depth * near).astype(np.float32),
         )  # fmt: skip
 
-    def turn_left_over(self, px: AnyArray, sigma_px: Array, xyz_cam: Array) -> Array:
-        """(6,) rad/s of turn, and no velocity, that corners px (N, 2) still show; points (N, 3) m, camera frame.
+    def turn_left_over(
+        self, px: AnyArray, sigma_px: Array, xyz_cam: Array, expected: Array, covariance: Array
+    ) -> Array:
+        """(3,) rad/s of turn that corners px (N, 2) still show; points (N, 3) m, camera frame.
 
-        Linear in the turn, and in the pose, which is free beside it: a turn moves later rows farther. Held near zero
-        as far as few or badly spread corners leave it open.
+        expected (3,) rad/s, covariance (3, 3) : what is known of it without the rows
+        Linear in the turn, and in the pose, which is free beside it: a turn moves later rows farther.
         """
-        expected = self._project(xyz_cam)
+        predicted = self._project(xyz_cam)
         turned, shifted = self._derivatives(xyz_cam)
         delayed = self._delay_s(px)[:, None, None] * turned
         A = (np.concatenate([delayed, turned, shifted], axis=2) / sigma_px[:, None, None]).reshape(-1, 9)
-        r = ((expected - px) / sigma_px[:, None]).reshape(-1)
-        H = A.T @ A + np.diag([UNKNOWN_TURN**-2] * 3 + [UNMEASURED] * 6)
-        out: Array = np.append(np.linalg.solve(H, A.T @ r)[:3], np.zeros(3))
+        r = ((predicted - px) / sigma_px[:, None]).reshape(-1)
+        H, g = A.T @ A + UNMEASURED * np.eye(9), A.T @ r
+        information = np.linalg.inv(covariance)
+        H[:3, :3] += information
+        g[:3] += information @ expected
+        out: Array = np.linalg.solve(H, g)[:3]
         return out
 
     def reach_px(self, twist: Array) -> float:
         """How far a turn moves the last row, nearly."""
-        return float(np.linalg.norm(twist[:3])) * self.row_time_s * self.camera.height * self.camera.focal_px
+        return float(np.linalg.norm(twist[:3])) * self.readout_s * self.camera.focal_px
 
     def _derivatives(self, xyz_cam: Array) -> tuple[Array, Array]:
         """(N, 2, 3) of pixels by a turn of the points about the camera, px/rad, and by a shift of them, px/m."""

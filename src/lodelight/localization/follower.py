@@ -15,6 +15,7 @@ from lodelight.features.matching import FeatureIndex
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.localization.influence import MOST, leverage
+from lodelight.localization.motion import Motion
 from lodelight.localization.temporary import TemporaryPoints
 from lodelight.localization.tracker import Landmarks, Tracked, Tracker, TrackerConfig
 from lodelight.mapping.map import Map
@@ -46,7 +47,7 @@ class Follower(Tracker):
     def forget(self) -> None:
         """The camera may be anywhere now."""
         self.last = None
-        self._motion = None
+        self._motion = Motion()
 
     def forget_temporary(self) -> None:
         """Clear the overlay, and the last frame's matches with it."""

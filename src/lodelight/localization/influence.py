@@ -15,7 +15,7 @@ from lodelight.compiled import kernel
 from lodelight.estimation.factors.reprojection import reprojection
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
-from lodelight.types import AnyArray, Array, Bools
+from lodelight.types import AnyArray, Array
 
 MOST = 0.5  # of what predicts an observation may be itself
 
@@ -24,7 +24,8 @@ def leverage(
     T_world_body: SE3, T_body_cam: SE3, camera: Camera, xyz: AnyArray, px: AnyArray, sigma_px: AnyArray,
     inv_depth: AnyArray, sigma_inv_depth: AnyArray, weight: AnyArray,
 ) -> Array:  # fmt: skip
-    """(N,) leverage of every observation on the pose, in the direction where it is largest, 0 to 1.
+    """(N,) leverage of every observation on the pose, in the direction where it is largest: what is above MOST is
+    exact, and what is said to be below is at most as large as said.
 
     As for `optimize_pose`; weight : (N,) information weight, 0 where an observation has no say
     """
@@ -35,7 +36,7 @@ def leverage(
     J *= np.sqrt(weight)[:, None, None]
     information = np.einsum("nia,nib->ab", J, J)
     hat = np.einsum("nia,ab,njb->nij", J, np.linalg.pinv(information, hermitian=True), J)
-    out = np.einsum("nii->n", hat)
+    out: Array = np.einsum("nii->n", hat).copy()
     large = np.flatnonzero(out > MOST)  # a trace is no less than the largest eigenvalue
     out[large] = np.linalg.eigvalsh(hat[large])[:, -1]
     return out

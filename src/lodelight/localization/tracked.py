@@ -8,7 +8,6 @@ import numpy as np
 
 from lodelight.estimation.pose import PoseResult
 from lodelight.features.features import Features
-from lodelight.features.shutter import STILL
 from lodelight.geometry.se3 import SE3
 from lodelight.types import Array, ArrayF32, Ints, Words
 
@@ -34,7 +33,6 @@ class Tracked:
 
     point : (N,) map point of every feature, -1 = none; inliers only
     reference : the keyframe that sees most of those points; noise : sigma of its corners over a sharp frame's
-    twist : (6,) rad/s, m/s in the camera's frame, by which a rolling shutter was straightened
     temporary : (N,) temporary point of every feature, -1 = none; None where there are no such points
     """
 
@@ -45,7 +43,6 @@ class Tracked:
     point: Ints
     reference: int
     noise: float = 1.0
-    twist: Array = field(default_factory=lambda: STILL)
     why_lost: str = ""
     T_reference_body: SE3 = field(default_factory=SE3.identity)
     temporary: Ints | None = None

@@ -14,6 +14,7 @@ from lodelight.features.orb import OrbConfig
 from lodelight.features.shutter import STILL, Shutter
 from lodelight.geometry.pnp import ransac_pnp
 from lodelight.geometry.se3 import SE3
+from lodelight.localization.motion import Motion
 from lodelight.localization.tracked import Fit, Landmarks, Tracked, TrackerConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import Sight, in_sight, local_keyframes, points_of_keyframes
@@ -35,7 +36,7 @@ MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may ha
 
 
 class Tracker:
-    """Follows the camera in a map that others write. Keeps only the last frame and the motion between the last two."""
+    """Follows the camera in a map that others write. Keeps only the last frame and the motion up to it."""
 
     def __init__(self, rig: Rig, map: Map, orb: OrbConfig, config: TrackerConfig, seed: int = 0) -> None:
         self.map = map
@@ -46,7 +47,7 @@ class Tracker:
         self.T_body_cam = rig.cameras[0].T_body_cam
         self.shutter = Shutter(rig.cameras[0])
         self.last: Tracked | None = None
-        self._motion: tuple[SE3, int] | None = None  # T_previous_last and the time it took, ns
+        self._motion = Motion()
 
     # -- the loop's two calls -----------------------------------------------------------------------------------
 
@@ -59,8 +60,9 @@ class Tracker:
         assert self.last is not None
         last = self.last
         T_world_last = self._moved_with_map(last)
-        predicted = self._predict(T_world_last, t_ns)
-        twist = self._twist()
+        dt_s = (t_ns - last.t_ns) * 1e-9
+        predicted = T_world_last @ self._motion.over(dt_s)
+        twist = self._motion.of_camera(self.T_body_cam).twist
         seen = self.shutter.straightened(seen, twist)
         index = FeatureIndex(seen, self.camera.width, self.camera.height)
         recent = self._landmarks_of_frame(last, T_world_last)
@@ -115,12 +117,8 @@ class Tracker:
 
     def accept(self, tracked: Tracked) -> None:
         """Make this the last frame."""
-        last = self.last
-        if last is not None and not last.why_lost and not tracked.why_lost and tracked.t_ns > last.t_ns:
-            T_last_now = self._moved_with_map(last).inverse() @ tracked.T_world_body
-            self._motion = (T_last_now, tracked.t_ns - last.t_ns)
-        else:
-            self._motion = None
+        known = self.last is not None and not self.last.why_lost and not tracked.why_lost
+        self._motion = self._moving(tracked.t_ns, tracked.T_world_body, tracked.covariance) if known else Motion()
         tracked.T_reference_body = self.map.pose(tracked.reference).inverse() @ tracked.T_world_body
         self.last = tracked
 
@@ -144,48 +142,44 @@ class Tracker:
         """From a first pose to the last one. twist : by which `seen` was straightened"""
         T_world_body = fit.solved.T_world_body
         if self.shutter.rolls:
-            seen, twist, T_world_body = self._unrolled(seen, twist, fit)
+            seen, T_world_body = self._unrolled(t_ns, seen, twist, fit)
             index = FeatureIndex(seen, self.camera.width, self.camera.height)
-        tracked = self.refine(t_ns, seen, T_world_body, fit.point, index, search=3.0)
-        tracked.twist = twist
-        return tracked
+        return self.refine(t_ns, seen, T_world_body, fit.point, index, search=3.0)
 
-    def _unrolled(self, seen: Features, twist: Array, fit: Fit) -> tuple[Features, Array, SE3]:
-        """A frame of a rolling shutter straightened by the turn that its own rows show; its twist and its pose."""
-        used, T_world_body = np.flatnonzero(fit.point >= 0), fit.solved.T_world_body
+    def _unrolled(self, t_ns: int, seen: Features, twist: Array, fit: Fit) -> tuple[Features, SE3]:
+        """A frame of a rolling shutter straightened by how the camera moves, and by the turn that its own rows show
+        beyond that; and its pose. twist : by which `seen` was straightened so far"""
+        used, solved, noise = np.flatnonzero(fit.point >= 0), fit.solved, 1.0
         for _ in range(UNROLLINGS):
             if len(used) < self.config.min_matches:
                 break
             xyz = self.map.points.xyz[fit.point[used]]
-            xyz_cam = (T_world_body @ self.T_body_cam).inverse() @ xyz
-            more = self.shutter.turn_left_over(seen.px[used], self._sigma_px(seen.take(used)), xyz_cam)
+            xyz_cam = (solved.T_world_body @ self.T_body_cam).inverse() @ xyz
+            moving = self._moving(t_ns, solved.T_world_body, solved.covariance).of_camera(self.T_body_cam)
+            more = moving.twist - twist
+            more[:3] = self.shutter.turn_left_over(
+                seen.px[used], noise * self._sigma_px(seen.take(used)), xyz_cam,
+                more[:3], moving.later(0.5 * self.shutter.readout_s).covariance[:3, :3],
+            )  # fmt: skip
             seen, twist = self.shutter.straightened(seen, more), twist + more
-            solved, _ = self._solve(T_world_body, seen.take(used), xyz)
-            T_world_body, used = solved.T_world_body, used[solved.inliers]
+            solved, noise = self._solve(solved.T_world_body, seen.take(used), xyz)
+            used = used[solved.inliers]
             if self.shutter.reach_px(more) < SETTLED_PX:
                 break
-        return seen, twist, T_world_body
+        return seen, solved.T_world_body
+
+    def _moving(self, t_ns: int, T_world_body: SE3, covariance: Array) -> Motion:
+        """The motion of a body that is at T_world_body now, going by that and by how it moved before."""
+        last = self.last
+        if last is None or last.why_lost or t_ns <= last.t_ns:
+            return Motion()
+        dt_s = (t_ns - last.t_ns) * 1e-9
+        before = self._moved_with_map(last)
+        return self._motion.later(dt_s).measured(before, last.covariance, T_world_body, covariance, dt_s)
 
     def _moved_with_map(self, frame: Tracked) -> SE3:
         """T_world_body of a past frame, as its reference keyframe has been corrected since."""
         return self.map.pose(frame.reference) @ frame.T_reference_body
-
-    def _predict(self, T_world_last: SE3, t_ns: int) -> SE3:
-        """Constant velocity, for however long the last frame is ago; no motion where none is known."""
-        if self._motion is None or self.last is None:
-            return T_world_last
-        T_previous_last, dt_ns = self._motion
-        share = (t_ns - self.last.t_ns) / dt_ns
-        return T_world_last @ SE3.exp(share * T_previous_last.log())
-
-    def _twist(self) -> Array:
-        """(6,) rad/s and m/s in the camera's frame: the turn that the last frame's rows showed, the velocity it had."""
-        if not self.shutter.rolls or self._motion is None or self.last is None:
-            return STILL
-        T_previous_last, dt_ns = self._motion
-        T_cam_cam = self.T_body_cam.inverse() @ T_previous_last @ self.T_body_cam
-        velocity = T_cam_cam.log() / (dt_ns * 1e-9)
-        return np.append(self.last.twist[:3] if np.any(self.last.twist) else velocity[:3], velocity[3:])
 
     def _keyframe_near(self, T_world_body: SE3) -> int:
         """The one that is nearest, a radian of turn counting as much as RADIAN_M."""
