@@ -43,6 +43,7 @@ SCENARIOS = {
 RIGS = ("standard", "camera", "euroc")
 START_NS = 1_600_000_000_000_000_000
 LAPS = 1.2  # of the route in a recording whose length is not given: its first fifth is seen twice
+WANDERS = 20
 
 
 @dataclass(frozen=True)
@@ -112,11 +113,12 @@ def prepare(request: Request, threads: int = 2, lit: bool = True) -> Simulation:
     if given is not None and request.imu_file is not None:
         series = _passed_imu(Path(request.imu_file), given, request)
     place = unlit(request.scenario, request.seed, request.changed, faults)
+    space = Space(place)
     if given is None:
-        motion = _route_motion(request, place, faults)
+        motion = _route_motion(request, space, faults)
     else:
-        motion = _placed(request, given, place)
-    Space(place).check(motion)
+        motion = _placed(request, given, space)
+        space.check(motion)
     if series is None and rig.imu is not None:
         series = read_out(motion, rig.imu, np.random.default_rng([request.seed, 2]), TURN_ON[request.imu])
     given_files = {name: _digest(name) for name in (request.trajectory, request.imu_file, request.rig) if name}
@@ -212,16 +214,24 @@ def _duration(request: Request) -> float:
     return round(LAPS * lap_seconds(gait, _module(request.scenario).ROUTE) + request.standstill_s, 1)
 
 
-def _route_motion(request: Request, place: Building, faults: Faults) -> Motion:
+def _route_motion(request: Request, space: Space, faults: Faults) -> Motion:
+    """Along the building's route. Where its wander would brush against something, another wander is drawn."""
     duration_s, gait = _duration(request), GAITS[request.motion or SCENARIOS[request.scenario][1]]
-    ahead = 0.0 if faults.kidnap_s is None else 0.4 * lap_seconds(gait, place.route)
-    rng = np.random.default_rng([request.seed, 1])
-    route = place.route
+    route = space.building.route
+    ahead = 0.0 if faults.kidnap_s is None else 0.4 * lap_seconds(gait, route)
     if request.path:
-        route = another_way(route, Space(place), gait, np.random.default_rng([request.path, 4]))
-    motion = generate(gait, route, duration_s + ahead, START_NS, rng, request.standstill_s)
+        route = another_way(route, space, gait, np.random.default_rng([request.path, 4]))
     jump = None if faults.kidnap_s is None else (faults.kidnap_s, ahead)
-    return replace(motion, duration_s=duration_s, jump=jump)
+    for draw in range(WANDERS):
+        rng = np.random.default_rng([request.seed, 1, *([draw] if draw else [])])
+        motion = generate(gait, route, duration_s + ahead, START_NS, rng, request.standstill_s)
+        motion = replace(motion, duration_s=duration_s, jump=jump)
+        try:
+            space.check(motion)
+            return motion
+        except ConfigError as error:
+            touched = error
+    raise touched
 
 
 def _given_motion(request: Request) -> Motion | None:
@@ -239,8 +249,7 @@ def _given_motion(request: Request) -> Motion | None:
     return motion
 
 
-def _placed(request: Request, motion: Motion, place: Building) -> Motion:
-    space = Space(place)
+def _placed(request: Request, motion: Motion, space: Space) -> Motion:
     if request.place is None and request.imu_file is None and space.indoors(motion.at(0.0).xyz[0]):
         return motion
     if request.place in (None, "auto"):
