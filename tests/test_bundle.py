@@ -36,8 +36,8 @@ def residuals(problem: BundleProblem, poses: list[SE3], xyz) -> np.ndarray:
 @pytest.mark.parametrize("depth", [0.0, 0.6])
 def test_adjustment_agrees_with_scipy(lens, depth):
     rng = np.random.default_rng(1)
-    made = walk(rng, LENSES[lens], 5, 25, per_point=4.0, depth=depth)
-    many = np.bincount(made.problem.point, minlength=25)[made.problem.point] >= 2
+    made = walk(rng, LENSES[lens], 5, 16, per_point=4.5, depth=depth)
+    many = np.bincount(made.problem.point, minlength=16)[made.problem.point] >= 2
     problem = replace(
         made.problem,
         weight=rng.uniform(0.2, 1.0, many.sum()),
@@ -57,9 +57,9 @@ def test_adjustment_agrees_with_scipy(lens, depth):
         return moved, problem.xyz + x[6 * len(free) :].reshape(-1, 3)
 
     theirs = least_squares(
-        lambda x: residuals(problem, *state(x)), np.zeros(6 * len(free) + 75), x_scale="jac", xtol=1e-12, ftol=1e-12
+        lambda x: residuals(problem, *state(x)), np.zeros(6 * len(free) + 48), x_scale="jac", xtol=1e-12, ftol=1e-12
     )
-    assert ours.cost[-1] == pytest.approx(2 * theirs.cost, rel=1e-8)
+    assert ours.cost[-1] == pytest.approx(2 * theirs.cost, abs=1e-6)  # where our next step promises less than that
     for k in free:
         d = chart_error(poses(ours)[k], state(theirs.x)[0][k])
         assert d @ np.linalg.solve(ours.covariance[k], d) < 1e-4  # a hundredth of a standard deviation

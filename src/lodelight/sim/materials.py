@@ -10,6 +10,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -281,6 +282,9 @@ MATERIALS["white_brick"] = lambda rng: brick(rng, body=0.68, joint=0.5)
 MATERIALS["dark_planks"] = lambda rng: planks(rng, shade=0.26)
 
 
+@lru_cache(maxsize=32)  # a building's worth: the next recording of the same building has its pictures at once
 def make(name: str, seed: int) -> Material:
     """A material by its name; the same name and seed give the same picture whatever else was made before."""
-    return MATERIALS[name](np.random.default_rng([seed, zlib.crc32(name.encode())]))
+    material = MATERIALS[name](np.random.default_rng([seed, zlib.crc32(name.encode())]))
+    material.picture.setflags(write=False)
+    return material
