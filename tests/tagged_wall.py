@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from lodelight.anchors import Tag
 from lodelight.fiducials import fiducial_modules
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
+from lodelight.io.euroc_writer import append_image, append_truth, stored_depth, write_sensors
 from lodelight.messages import Frame
 from lodelight.rig import CameraSpec, DepthSpec, Rig
 
@@ -26,6 +28,7 @@ TAGS = (  # on the wall: x to the right, y down, z into it
 # The wall in the world: upright, seen along y; the world's z is up.
 T_WORLD_WALL = SE3(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), np.array([5.0, 7.0, 3.0]))
 STEP_NS = 50_000_000
+N_POSES = 40  # of the walk that recordings are parts of
 
 
 def surveyed(tag: Tag, moved=(0.0, 0.0, 0.0)) -> Tag:
@@ -67,3 +70,17 @@ def frame(wall: np.ndarray, T_wall_cam: SE3, t_ns: int) -> Frame:
     image = cv2.remap(wall, xy.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     image = image + np.random.default_rng(t_ns).normal(0, 2, image.shape)
     return Frame(t_ns, (np.clip(image, 0, 255).astype(np.uint8),), along.astype(np.float32))
+
+
+def write_walk(folder: Path, wall: np.ndarray, first: int, last: int) -> Path:
+    """A part of the walk past the wall, with its truth."""
+    folders = write_sensors(folder, RIG)
+    truth = folders["state_groundtruth_estimate0"]
+    for k, T_wall_cam in list(enumerate(poses(N_POSES)))[first:last]:
+        seen = frame(wall, T_wall_cam, (k + 1) * STEP_NS)
+        append_image(folders["cam0"], seen.t_ns, seen.images[0])
+        append_image(folders["depth0"], seen.t_ns, stored_depth(seen.depth, RIG.depth))
+        still = np.zeros((1, 3))
+        quat_wxyz = np.roll(T_wall_cam.quat_xyzw, 1)[None]
+        append_truth(truth, np.array([seen.t_ns]), T_wall_cam.t[None], quat_wxyz, still, still, still)
+    return folder

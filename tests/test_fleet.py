@@ -22,26 +22,9 @@ from lodelight.cli.fleet import run_one
 from lodelight.cli.main import main
 from lodelight.fleet.jobs import Job, jobs_of
 from lodelight.fleet.workers import in_processes, on_cluster
-from lodelight.io.euroc_writer import append_image, append_truth, stored_depth, write_sensors
 from lodelight.mapping.store import check_map, load_map
 from recordings import write_tum
-from tagged_wall import RIG, STEP_NS, frame, poses, wall_picture
-
-N = 40
-
-
-def write_walk(folder: Path, wall: np.ndarray, first: int, last: int) -> Path:
-    """A part of the walk past the wall, with its truth."""
-    folders = write_sensors(folder, RIG)
-    truth = folders["state_groundtruth_estimate0"]
-    for k, T_wall_cam in list(enumerate(poses(N)))[first:last]:
-        seen = frame(wall, T_wall_cam, (k + 1) * STEP_NS)
-        append_image(folders["cam0"], seen.t_ns, seen.images[0])
-        append_image(folders["depth0"], seen.t_ns, stored_depth(seen.depth, RIG.depth))
-        still = np.zeros((1, 3))
-        quat_wxyz = np.roll(T_wall_cam.quat_xyzw, 1)[None]
-        append_truth(truth, np.array([seen.t_ns]), T_wall_cam.t[None], quat_wxyz, still, still, still)
-    return folder
+from tagged_wall import N_POSES, STEP_NS, poses, wall_picture, write_walk
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +65,7 @@ def test_one_bad_recording_does_not_stop_the_others_and_is_named(building):
 def test_all_that_was_mapped_is_in_one_map_in_one_frame(building):
     out = building[0]
     assert check_map(out / "map.lode") == []
-    map, truth = load_map(out / "map.lode"), list(poses(N))
+    map, truth = load_map(out / "map.lode"), list(poses(N_POSES))
     true_p = np.array([truth[int(t) // STEP_NS - 1].t for t in map.keyframes.t_ns])
     apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (map.keyframes.p, true_p)]
     assert np.abs(apart[0] - apart[1]).max() < 0.02  # from one end of the wall to the other

@@ -8,7 +8,7 @@ SRC = Path(__file__).parents[1] / "src"
 # Highest first. What stands in one row is one layer, whose members do not see each other.
 LAYERS = [
     ["__main__"],
-    ["cli"],
+    ["cli", "ros"],
     ["slam", "localizer", "doctor", "fleet"],
     ["inertial"],
     ["localization"],

@@ -16,8 +16,7 @@ from lodelight.anchors import Anchors
 from lodelight.cli.main import main
 from lodelight.cli.watching import Watcher
 from lodelight.slam import Slam, SlamConfig
-from tagged_wall import RIG, STEP_NS, TAGS, frame, poses, wall_picture
-from test_fleet import write_walk
+from tagged_wall import RIG, STEP_NS, TAGS, frame, poses, wall_picture, write_walk
 
 pytest.importorskip("rerun", reason='needs rerun (pip install "lodelight[viewer]")')
 ENTITIES = (

@@ -141,7 +141,7 @@ class _Places:
         T_body_cam = self.of(topic)
         if topic == self._first or (T_body_cam is not None and self._frame_of[topic] != self.cam0):
             return T_body_cam
-        T_cam0_cam = _by_projection(self.info(self._first), self.info(topic))
+        T_cam0_cam = pair_by_projection(self.info(self._first), self.info(topic))
         T_body_cam0 = self.of(self._first)
         return None if T_cam0_cam is None or T_body_cam0 is None else T_body_cam0 @ T_cam0_cam
 
@@ -164,10 +164,17 @@ def _depth(place: _Places, topic: str, cam0: CameraSpec) -> DepthSpec | None:
 
 
 def _lens(bag: Bag, topic: str, info: Any) -> Camera:
-    """The lens of a CameraInfo: of the rectified image where the topic says it is one."""
+    return lens_of_info(info, topic, str(bag.path))
+
+
+def lens_of_info(info: Any, topic: str, source: str = "the") -> Camera:
+    """The lens of a CameraInfo: of the rectified image where its topic says it is one.
+
+    Raises CalibrationError, which names the source, where it is not calibrated or of a model not known here.
+    """
     upper = hasattr(info, "K")  # ROS 1 writes K, D, P; ROS 2 k, d, p
     K, D, P = (getattr(info, name if upper else name.lower()) for name in "KDP")
-    where = f"{bag.path} CameraInfo of {topic}:"
+    where = f"{source} CameraInfo of {topic}:"
     if not np.any(K):
         raise CalibrationError(f"{where} all zero: the camera was not calibrated; give --rig FILE")
     rectified = "rect" in topic.rsplit("/", 2)[-1] or "rect" in topic.rsplit("/", 2)[-2]
@@ -187,7 +194,7 @@ def _lens(bag: Bag, topic: str, info: Any) -> Camera:
     return matrix_camera(Section(table, where))
 
 
-def _by_projection(first: Any | None, other: Any | None) -> SE3 | None:
+def pair_by_projection(first: Any | None, other: Any | None) -> SE3 | None:
     """T_cam0_cam1 of a stereo pair from R and P, which is where ROS keeps it; None where they hold no baseline.
 
     p_rect = R p, and the rectified frames differ by P[3] / P[0] along x.
