@@ -59,7 +59,7 @@ def test_a_point_that_is_not_where_it_was_mapped_does_not_move_the_pose_however_
     overlay = TemporaryPoints(OTHER.cameras[0], ORB, TemporaryConfig(), 1.0)
     follower = Follower(OTHER, corridor.mapped(0), ORB, TrackerConfig(), overlay)
     start = TRUE.perturbed(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
-    solved, _ = follower._solve_without_leverage(start, seen_at(px), xyz, np.ones(len(xyz)))
+    solved, _ = follower._solve_without_leverage(start, seen_at(px), xyz, np.ones(len(xyz)), np.zeros(len(xyz)), None)
     off_m = np.linalg.norm(solved.T_world_body.t - TRUE.t)
     assert off_m < 3.5 * np.sqrt(np.trace(solved.covariance[3:, 3:]))
     assert not solved.inliers[-1]

@@ -167,6 +167,31 @@ def test_a_camera_lost_while_it_was_carried_leaves_nothing_temporary_behind():
     assert lost.ladder.temporary_left == 0
 
 
+@pytest.mark.parametrize("carrying", [True, False])
+def test_a_camera_that_turns_on_the_spot_to_where_nothing_is_mapped_is_carried_there_and_back(carrying):
+    # nothing has parallax, so no point can be triangulated: directions alone hold the pose
+    corridor = Corridor.built(1)
+    rng, map = np.random.default_rng(6), corridor.mapped(1)
+    ladder = Ladder(OTHER, map, ORB, LadderConfig(), 0, carrying, False, lambda *_, **__: None)
+    away_deg = np.arange(0.0, 141.0, 4.0)
+    status, off_m, off_deg = [], [], []
+    for i, yaw_deg in enumerate([*away_deg, *away_deg[::-1]]):
+        T_world_body = walk(10.0) @ SE3.exp(np.array([0.0, 0.0, np.radians(yaw_deg), 0.0, 0.0, 0.0]))
+        tracked = ladder.locate(i * S // 10, corridor.seen(OTHER, T_world_body, rng)[0])
+        off = T_world_body.inverse() @ tracked.T_world_body
+        status.append(ladder.status)
+        off_m.append(np.linalg.norm(off.t))
+        off_deg.append(np.degrees(off.angle))
+    assert status[-1] == "tracking"
+    assert ladder.temporary_left == 0
+    if carrying:
+        assert "lost" not in status
+        assert max(off_m) < 0.05
+        assert max(off_deg) < 2.0
+    else:
+        assert status.count("lost") > 15
+
+
 def test_darkness_in_a_known_place_is_over_with_the_first_frame_that_shows_something():
     dark = Walk(dark_s=(6.0, 9.0), x_m=(2.0, 12.0))
     assert dark.status[59] == "tracking"

@@ -89,7 +89,12 @@ class Follower(Tracker):
         xyz[of_map] = map.points.xyz[mapped[used[of_map]]]
         xyz[~of_map] = overlay.xyz[carried[used[~of_map]]]
         weight = np.where(of_map, 1.0, self.temporary.config.weight)
-        solved, noise = self._solve_without_leverage(T_world_body, seen.take(used), xyz, weight)
+        spread, prior = np.zeros(len(used)), None
+        if not of_map.all():
+            centre = (T_world_body @ self.T_body_cam).t
+            spread[~of_map] = self.camera.focal_px * self.temporary.uncertainty(carried[used[~of_map]], centre)
+            prior = self._expected(t_ns)
+        solved, noise = self._solve_without_leverage(T_world_body, seen.take(used), xyz, weight, spread, prior)
         wrong = used[~solved.inliers]
         mapped[wrong], carried[wrong] = -1, -1
         if use_overlay:
@@ -103,14 +108,15 @@ class Follower(Tracker):
         return tracked
 
     def _solve_without_leverage(
-        self, start: SE3, seen: Features, xyz: Array, weight: Array
+        self, start: SE3, seen: Features, xyz: Array, weight: Array, spread: Array, prior: tuple[SE3, Array] | None
     ) -> tuple[PoseResult, float]:
         """As `_solve`, by points of which none decides by itself: those are only tested at the end."""
         weight = weight.copy()
         for _ in range(MOST_DECIDING):
-            solved, noise = self._solve(start, seen, xyz, weight)
+            solved, noise = self._solve(start, seen, xyz, weight, spread, prior)
             held = leverage(
-                solved.T_world_body, self.T_body_cam, self.camera, xyz, seen.px, noise * self._sigma_px(seen),
+                solved.T_world_body, self.T_body_cam, self.camera, xyz, seen.px,
+                np.hypot(noise * self._sigma_px(seen), spread),
                 seen.inv_depth, noise * seen.sigma_inv_depth, np.where(solved.inliers, weight, 0.0),
             )  # fmt: skip
             most = int(np.argmax(held)) if len(held) else 0
@@ -118,6 +124,25 @@ class Follower(Tracker):
                 break
             weight[most] = 0.0
         return solved, noise
+
+    def _expected(self, t_ns: int) -> tuple[SE3, Array] | None:
+        """Where the camera should be by how it moved, and the information (6, 6) of that; None where nothing is known:
+        points without a distance leave it open how far it went."""
+        last = self.last
+        if last is None or last.why_lost or t_ns <= last.t_ns:
+            return None
+        dt_s = (t_ns - last.t_ns) * 1e-9
+        motion, T_world_last = self._motion.later(dt_s), self._moved_with_map(last)
+        turned = np.eye(6)
+        turned[3:, 3:] = T_world_last.R
+        covariance = last.covariance + dt_s**2 * turned @ motion.covariance @ turned.T
+        return T_world_last @ self._motion.over(dt_s), np.linalg.inv(covariance)
+
+    def distances(self, tracked: Tracked) -> Array:
+        """(K,) m of the map's points that a frame sees."""
+        centre = (tracked.T_world_body @ self.T_body_cam).t
+        out: Array = np.linalg.norm(self.map.points.xyz[tracked.point[tracked.point >= 0]] - centre, axis=1)
+        return out
 
     def _around(self, T_world_body: SE3, point: Ints) -> Ints:
         """Keyframes whose points make the local map: those that see what the frame sees, and where that is little,

@@ -151,7 +151,7 @@ class Ladder:
             self.emit(t_ns, "carried", begins=True, why=self.states.why)
         well = tracked.n_inliers >= self.config.states.good_inliers
         if self.states.state is State.carried:
-            self.temporary.grow(tracked)
+            self.temporary.grow(tracked, self.follower.distances(tracked))
             if self.temporary.remember(tracked, well):
                 adjust_window(self.temporary, self.map, tracked, self.config.tracking.sigma_px)
             tracked = self._look_beside(tracked)

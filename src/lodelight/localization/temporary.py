@@ -27,6 +27,8 @@ NEVER_BELOW_DEG = 1.15  # of parallax: farther points are a matter of noise
 SAME_SCALE = 1.8  # by how much sizes of a patch in two images may differ from what its distances say: 1.5 x an octave
 NEAR_M = 0.05  # of baseline, below which no pair of frames is tried
 VIEW_COSINE = 0.5  # of the angle between two views that may show the same
+SUPPOSED = 0.5  # of an inverse distance that is not measured, one standard deviation as a share of it
+ENOUGH_DISTANCES = 10  # measured in a frame, to suppose others from
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class TemporaryPoints:
         self.config = config
         self.sigma_rad = sigma_px / spec.camera.focal_px
         self.created = 0
+        self._usual_m: float | None = None  # distance of what was seen last
         self._past: deque[Past] = deque(maxlen=config.past_frames)
         self._new_table()
 
@@ -89,7 +92,7 @@ class TemporaryPoints:
     def clear(self) -> int:
         """Forget all points and all that names them; returns how many there were. Earlier frames that the map alone
         held stay: they are as good as before."""
-        there = len(self)
+        there, self._usual_m = len(self), None
         self._new_table()
         for past in self._past:
             past.temporary[:] = -1
@@ -147,8 +150,11 @@ class TemporaryPoints:
 
     # -- how they are made --------------------------------------------------------------------------------------
 
-    def grow(self, tracked: Tracked) -> int:
-        """New points from what a frame sees and nothing explains yet; its `temporary` names them. Returns how many."""
+    def grow(self, tracked: Tracked, distance_m: Array) -> int:
+        """New points from what a frame sees and nothing explains yet; its `temporary` names them. Returns how many.
+
+        distance_m : (K,) of the points of the map that it sees
+        """
         if tracked.temporary is None:
             tracked.temporary = _none(tracked.seen)
         before = self.created
@@ -157,7 +163,20 @@ class TemporaryPoints:
             if self._matched(tracked) >= self.config.enough or len(self) >= self.config.most:
                 break
             self._triangulate(tracked, past)
+        self._suppose(tracked, distance_m)
         return self.created - before
+
+    def uncertainty(self, temporary: Ints, centre: Array) -> Array:
+        """(K,) rad: how far from where points should appear to a camera at centre they may, for want of a distance."""
+        moved = np.linalg.norm(self.table.centre[temporary] - centre, axis=1)
+        out: Array = moved * self.table.sigma_inv_distance[temporary]
+        return out
+
+    def measured(self, temporary: AnyArray) -> Bools:
+        """(N,) which of them name a point whose distance is measured, and not supposed."""
+        known = self.table.sigma_inv_distance == 0.0
+        out: Bools = (temporary >= 0) & (known[np.maximum(temporary, 0)] if len(known) else False)
+        return out
 
     def _matched(self, tracked: Tracked) -> int:
         return int(np.count_nonzero(_taken(tracked.point, tracked.temporary)))
@@ -195,9 +214,27 @@ class TemporaryPoints:
                         break
         return chosen
 
+    def _suppose(self, tracked: Tracked, distance_m: Array) -> None:
+        """Points as far away as others are, of what nothing explains: they hold the direction of a camera that turns
+        on the spot, where nothing has parallax, and count for less the farther it has moved from where it saw them."""
+        assert tracked.temporary is not None
+        T_world_cam = tracked.T_world_body @ self.spec.T_body_cam
+        named = tracked.temporary[self.measured(tracked.temporary)]
+        distances = np.append(distance_m, np.linalg.norm(self.table.xyz[named] - T_world_cam.t, axis=1))
+        if len(distances) >= ENOUGH_DISTANCES:
+            self._usual_m = float(np.median(distances))
+        rows = np.flatnonzero(~_taken(tracked.point, tracked.temporary))
+        rows = rows[: max(min(self.config.enough - self._matched(tracked), self.config.most - len(self)), 0)]
+        if self._usual_m is None or len(rows) == 0:
+            return
+        seen = tracked.seen.take(rows)
+        xyz = T_world_cam @ (self._usual_m * seen.ray)
+        tracked.temporary[rows] = self._add(xyz, seen, T_world_cam.t, SUPPOSED / self._usual_m)
+
     def _triangulate(self, tracked: Tracked, past: Past) -> None:
-        free = np.flatnonzero(~_taken(tracked.point, tracked.temporary))
-        free_there = np.flatnonzero(~_taken(past.point, past.temporary))
+        assert tracked.temporary is not None
+        free = np.flatnonzero((tracked.point < 0) & ~self.measured(tracked.temporary))
+        free_there = np.flatnonzero((past.point < 0) & ~self.measured(past.temporary))
         if len(free) == 0 or len(free_there) == 0:
             return
         a, b = tracked.seen.take(free), past.seen.take(free_there)
@@ -227,18 +264,20 @@ class TemporaryPoints:
         good &= np.abs(np.log(np.maximum(size, 1e-9) / np.maximum(expected, 1e-9))) < math.log(SAME_SCALE)
         ia, ib = ia[good], ib[good]
         ids = self._add(made.xyz[good], a.take(ia), T_world_a.t)
-        assert tracked.temporary is not None
+        for replaced in (tracked.temporary[free[ia]], past.temporary[free_there[ib]]):
+            self.table.alive[replaced[replaced >= 0]] = False
         tracked.temporary[free[ia]] = ids
         past.temporary[free_there[ib]] = ids
 
-    def _add(self, xyz: Array, seen: Features, centre: Array) -> Ints:
+    def _add(self, xyz: Array, seen: Features, centre: Array, sigma_inv_distance: float = 0.0) -> Ints:
         n = len(xyz)
         ray = xyz - centre
         distance = np.linalg.norm(ray, axis=1)
         d_max = distance * self.orb.scale(seen.octave)
         start = self.table.append(
             n, xyz=xyz, desc=seen.desc, normal=ray / np.maximum(distance, 1e-9)[:, None], d_max=d_max,
-            d_min=d_max / self.orb.scale_factor ** (self.orb.n_levels - 1), alive=True,
+            d_min=d_max / self.orb.scale_factor ** (self.orb.n_levels - 1), alive=True, centre=centre,
+            sigma_inv_distance=sigma_inv_distance,
         )  # fmt: skip
         self.created += n
         return np.arange(start, start + n, dtype=np.int32)
@@ -251,7 +290,8 @@ class TemporaryPoints:
         f64, i32 = np.float64, np.int32
         self.table = Table(
             xyz=(f64, (3,)), desc=(np.uint64, (4,)), normal=(f64, (3,)), d_min=(f64, ()), d_max=(f64, ()),
-            n_visible=(i32, ()), n_found=(i32, ()), alive=(np.bool_, ()),
+            n_visible=(i32, ()), n_found=(i32, ()), alive=(np.bool_, ()), centre=(f64, (3,)),
+            sigma_inv_distance=(f64, ()),
         )  # fmt: skip
 
 

@@ -255,10 +255,14 @@ class Tracker:
         excess = solved.n_inliers - chance * n - CHANCE_SIGMA * math.sqrt(chance * (1.0 - chance) * n)
         return max(excess, 0.0) / (INLIERS - chance) if chance < INLIERS else 0.0
 
-    def _solve(self, start: SE3, seen: Features, xyz: Array, weight: Array | float = 1.0) -> tuple[PoseResult, float]:
+    def _solve(
+        self, start: SE3, seen: Features, xyz: Array, weight: Array | float = 1.0, spread: Array | float = 0.0,
+        prior: tuple[SE3, Array] | None = None,
+    ) -> tuple[PoseResult, float]:  # fmt: skip
         """Motion-only optimization of features against world positions (N, 3), and by how much this frame's noise
         exceeds a sharp one's.
 
+        spread : (N,) px by which a position may be off, beside the noise of its corner; prior : as in `optimize_pose`
         Pairs of which the start already says that one is much farther than the other are put out of reach first: a
         wrong match close to the camera has a hold on the pose that no robust kernel takes from it.
         A blurred or quickly turning camera measures worse than its calibration says. Tested against the noise of a
@@ -271,8 +275,9 @@ class Tracker:
         noise = 1.0
         for _ in range(2):
             solved = optimize_pose(
-                start, self.T_body_cam, self.camera, xyz, seen.px, noise * self._sigma_px(seen),
-                seen.inv_depth, noise * seen.sigma_inv_depth, information_weight=information,
+                start, self.T_body_cam, self.camera, xyz, seen.px,
+                np.hypot(noise * self._sigma_px(seen), spread), seen.inv_depth, noise * seen.sigma_inv_depth,
+                information_weight=information, prior=prior,
             )  # fmt: skip
             expected = np.where(seen.inv_depth > 0, MEDIAN_CHI2_3, MEDIAN_CHI2_2)
             excess = np.median((solved.chi2 / expected)[possible]) if possible.any() else 1.0

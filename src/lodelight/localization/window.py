@@ -29,7 +29,8 @@ def adjust_window(temporary: TemporaryPoints, map: Map, tracked: Tracked, sigma_
     fixed = np.array([past.well for past in frames])
     if not fixed.any():
         fixed[:2] = True
-    sees = [_observations(past) for past in frames]
+    sees = [_observations(past, temporary) for past in frames]
+    fixed |= np.array([len(rows) < MIN_FREE_POINTS for rows, _, _ in sees])  # what they see says nothing of distances
     carried = np.unique(np.concatenate([t[t >= 0] for _, _, t in sees]))
     if fixed.all() or len(carried) < MIN_FREE_POINTS:
         return
@@ -37,7 +38,6 @@ def adjust_window(temporary: TemporaryPoints, map: Map, tracked: Tracked, sigma_
     feature = [past.seen.take(rows) for past, (rows, _, _) in zip(frames, sees, strict=True)]
     index = np.concatenate([_index(p, t, known, carried) for _, p, t in sees])
     noise = np.concatenate([np.full(len(rows), past.noise) for past, (rows, _, _) in zip(frames, sees, strict=True)])
-    columns = ("px", "octave", "inv_depth", "sigma_inv_depth")
     columns = ("px", "octave", "inv_depth", "sigma_inv_depth")
     seen = {name: np.concatenate([getattr(f, name) for f in feature]) for name in columns}
     result = bundle_adjust(
@@ -62,9 +62,9 @@ def adjust_window(temporary: TemporaryPoints, map: Map, tracked: Tracked, sigma_
     tracked.T_world_body = frames[-1].T_world_body
 
 
-def _observations(past: Past) -> tuple[Ints, Ints, Ints]:
-    """Features that name a point of either kind, and which."""
-    rows = np.flatnonzero((past.point >= 0) | (past.temporary >= 0)).astype(np.int32)
+def _observations(past: Past, temporary: TemporaryPoints) -> tuple[Ints, Ints, Ints]:
+    """Features that name a point of either kind whose distance is measured, and which."""
+    rows = np.flatnonzero((past.point >= 0) | temporary.measured(past.temporary)).astype(np.int32)
     return rows, past.point[rows], past.temporary[rows]
 
 
