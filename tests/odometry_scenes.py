@@ -55,15 +55,15 @@ def flight(duration_s: float, seed: int = 0, rest_s: float = 0.0, speed: float =
 
 @dataclass(eq=False)
 class Points:
-    """Stands where the tracker stands: tracks of points on the walls of a room, with noise.
+    """Stands where the tracker stands: tracks of points on the walls of a room, that leave their points step by step.
 
-    sigma_px : white noise of a pixel; lost : share of tracks that end at every frame
+    sigma_px : noise of a step, and of what the second camera adds; lost : share of tracks that end at every frame
     """
 
     motion: Motion
     rig: Rig
     seed: int = 0
-    sigma_px: float = 0.5
+    sigma_px: float = 0.1
     wanted: int = 150
     lost: float = 0.02
     outliers: float = 0.0
@@ -75,6 +75,8 @@ class Points:
         self.xyz = np.zeros((0, 3))
         self.ids = np.zeros(0, np.int64)
         self.age = np.zeros(0, np.int32)
+        self.off = np.zeros((0, 2))
+        self.wander_px2 = 0.0
         self.next_id = 0
         self.tracks: Tracks | None = None
 
@@ -87,20 +89,24 @@ class Points:
         if len(self.ids):
             _, seen = self._ahead(T, 0)
             keep = seen & (self.rng.random(len(seen)) > self.lost)
-            self.xyz, self.ids, self.age = self.xyz[keep], self.ids[keep], self.age[keep] + np.int32(1)
+            self._keep(keep)
+            self.age = self.age + np.int32(1)
+            self.off = self.off + self.sigma_px * self.rng.standard_normal(self.off.shape)
+        self.wander_px2 += self.sigma_px**2
         self._fill(T)
         px, _ = self._ahead(T, 0)
-        px = px + self.sigma_px * self.rng.standard_normal(px.shape)
+        px = px + self.off
         wrong = self.rng.random(len(px)) < self.outliers
         px[wrong] += self.rng.uniform(-30, 30, (wrong.sum(), 2))
         ray, _ = self.rig.cameras[0].camera.unproject(px)
         right = np.full(px.shape, np.nan, np.float32)
         if len(self.rig.cameras) > 1:
             there, seen = self._ahead(T, 1)
-            there = there + self.sigma_px * self.rng.standard_normal(px.shape)
+            there = there + self.off + self.sigma_px * self.rng.standard_normal(px.shape)
             right[seen] = there[seen]
         none = np.zeros(len(px))
-        now = Tracks(frame.t_ns, self.ids, self.age, px.astype(np.float32), ray, right, none, none)
+        noise = (self.sigma_px, self.sigma_px, self.wander_px2)
+        now = Tracks(frame.t_ns, self.ids, self.age, px.astype(np.float32), ray, right, none, none, *noise)
         if self.tracks is not None:
             self._compare(self.tracks, now)
         self.tracks = now
@@ -128,11 +134,14 @@ class Points:
         self.xyz = np.vstack([self.xyz, T_world_cam.t + away[:, None] * d])
         self.ids = np.concatenate([self.ids, np.arange(self.next_id, self.next_id + n)])
         self.age = np.concatenate([self.age, np.zeros(n, np.int32)])
+        self.off = np.vstack([self.off, np.zeros((n, 2))])
         self.next_id += n
 
     def drop(self, ids: Array) -> None:
-        keep = ~np.isin(self.ids, ids)
-        self.xyz, self.ids, self.age = self.xyz[keep], self.ids[keep], self.age[keep]
+        self._keep(~np.isin(self.ids, ids))
+
+    def _keep(self, keep: Array) -> None:
+        self.xyz, self.ids, self.age, self.off = (a[keep] for a in (self.xyz, self.ids, self.age, self.off))
 
     def reset(self) -> None:
         self.drop(self.ids)

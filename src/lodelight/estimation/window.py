@@ -193,6 +193,7 @@ class Window:
         solution = Solution(
             good, problem.linear.cost, taken, n, n - int(rejected.sum()),
             np.unique(track[seen_now & rejected]),
+            problem.linear.imu_chi2 / max(15 * int(problem.use_imu.sum()), 1),
             {s.view.id: s.chi2 for s in newest.tags},
             tuple(s.view.id for s in newest.tags if not s.use),
         )  # fmt: skip

@@ -134,8 +134,11 @@ def _column(frames: list[WindowFrame], name: str, frame: Ints, row: Ints) -> Any
 
 def _chosen(s: Sightings, kept: Bools, landmarks: Bools, count: AnyArray) -> Sightings:
     start = np.concatenate([[0], np.cumsum(count[landmarks])]).astype(np.int32)
-    columns = ("frame", "camera", "px", "sigma_px", "inv_depth", "sigma_inv_depth", "shift_s", "rays")
-    return Sightings(s.track[landmarks], start, *(np.ascontiguousarray(getattr(s, name)[kept]) for name in columns))
+    columns = ("frame", "camera", "before", "px", "sigma_px", "inv_depth", "sigma_inv_depth", "shift_s", "rays")
+    out = Sightings(s.track[landmarks], start, *(np.ascontiguousarray(getattr(s, name)[kept]) for name in columns))
+    place = np.where(kept, np.cumsum(kept) - 1, -1)
+    out.before = np.where(out.before >= 0, place[out.before], -1).astype(np.int32)
+    return out
 
 
 def _placed(window: Window, s: Sightings, x: Array, motion: Array, models: Ints) -> tuple[Array, Array, float]:

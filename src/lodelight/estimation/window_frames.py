@@ -16,7 +16,9 @@ from lodelight.imu.samples import ImuSamples
 from lodelight.rig import CameraSpec
 from lodelight.types import AnyArray, Array, Bools, Ints
 
-COLUMNS = ("track", "camera", "px", "sigma_px", "inv_depth", "sigma_inv_depth", "shift_s", "rays")
+COLUMNS = ("track", "camera", "px", "sigma_px", "inv_depth", "sigma_inv_depth", "shift_s", "rays", "wander_px2")
+
+LEAST_STEP_PX2 = 0.02**2  # of a track from one frame to another
 
 
 @dataclass(eq=False)
@@ -31,6 +33,7 @@ class Seen:
     sigma_inv_depth: Array
     shift_s: Array
     rays: Array
+    wander_px2: Array
     rejected: Bools
 
     @staticmethod
@@ -53,7 +56,8 @@ class Seen:
         good &= np.isfinite(px).all(axis=1) & (sigma > 0.0) & np.isfinite(sigma) & np.isfinite(shift)
         track = np.asarray(o.track, np.int64)
         depth_sigma = np.where(depth > 0.0, depth_sigma, 1.0)
-        every = Seen(track, camera, px, sigma, depth, depth_sigma, shift, rays, np.zeros(n, bool))
+        wander = np.full(n, np.nan) if o.wander_px2 is None else np.asarray(o.wander_px2, np.float64)
+        every = Seen(track, camera, px, sigma, depth, depth_sigma, shift, rays, wander, np.zeros(n, bool))
         return every.kept(good)
 
     def __len__(self) -> int:
@@ -144,11 +148,27 @@ def gathered(frames: Sequence[WindowFrame]) -> tuple[Sightings, Ints, Ints]:
     order = order[np.repeat(enough, count)]
     start = np.concatenate([[0], np.cumsum(count[enough])]).astype(np.int32)
     sorted_columns = {name: np.ascontiguousarray(columns[name][order]) for name in COLUMNS[1:]}
+    wander = sorted_columns.pop("wander_px2")
+    before = _before(start, frame[order], sorted_columns["camera"], wander)
+    followed = (before >= 0) & (sorted_columns["camera"] == 0)
+    step2 = wander[followed] - wander[before[followed]]
+    sorted_columns["sigma_px"][followed] = np.sqrt(np.maximum(step2, LEAST_STEP_PX2))
     return (
-        Sightings(track=track[starts[enough]], start=start, frame=frame[order], **sorted_columns),
+        Sightings(track=track[starts[enough]], start=start, frame=frame[order], before=before, **sorted_columns),
         frame[order],
         row[order],
     )
+
+
+def _before(start: Ints, frame: Ints, camera: Ints, wander: Array) -> Ints:
+    """(N,) the row that each is held against, -1 = none: of camera 0 the last one of its track there, of another the
+    one of camera 0 in the same frame, as its patch was looked for there."""
+    n = len(frame)
+    first = np.repeat(start[:-1], np.diff(start))
+    own = np.where(camera == 0, np.arange(n), -1)
+    last = np.concatenate([[-1], np.maximum.accumulate(own)[:-1]]) if n else own
+    good = (last >= first) & np.isfinite(wander) & ((camera == 0) | (frame == frame[last]))
+    return np.where(good, last, -1).astype(np.int32)
 
 
 def joined_imu(frame: WindowFrame) -> ImuSamples:

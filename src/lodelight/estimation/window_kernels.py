@@ -62,9 +62,51 @@ def _turned_back(J: Array, at: int, motion: Array, f: int, tau: float) -> None:
 
 
 @kernel
+def _add_block(
+    J: Array, at: int, width: int, base: int, sign: float, depth: bool, compact: Array, column: Ints, n: int
+) -> int:
+    """Add columns `at` to at + width of J (3, n), times sign, to those of compact that stand for `base` on; returns how
+    many columns compact has now. depth : with the third row, which is held against nothing."""
+    where = n
+    for a in range(0, n):
+        if column[a] == base:
+            where = a
+            break
+    if where == n:
+        n += width
+        for a in range(width):
+            column[where + a] = base + a
+            compact[0, where + a] = compact[1, where + a] = compact[2, where + a] = 0.0
+    for a in range(width):
+        compact[0, where + a] += sign * J[0, at + a]
+        compact[1, where + a] += sign * J[1, at + a]
+        if depth:
+            compact[2, where + a] += J[2, at + a]
+    return n
+
+
+@kernel
+def _add_sighting(
+    J: Array, own: bool, sign: float, frame: int, anchor: int, camera: int, camera_anchor: int, pose_at: int,
+    mount_at: int, offset_at: int, compact: Array, column: Ints, n: int,
+) -> int:  # fmt: skip
+    """Add one sighting's derivatives to its unknowns; those of the landmark are dealt with elsewhere."""
+    if frame != anchor:
+        n = _add_block(J, 0, 6, pose_at + 6 * anchor, sign, own, compact, column, n)
+        n = _add_block(J, 6, 6, pose_at + 6 * frame, sign, own, compact, column, n)
+        if offset_at >= 0:
+            n = _add_block(J, 27, 1, offset_at, sign, own, compact, column, n)
+    # at the anchor's own pixel neither poses nor mountings have a say
+    if mount_at >= 0 and (frame != anchor or camera != camera_anchor):
+        n = _add_block(J, 15, 6, mount_at + 6 * camera_anchor, sign, own, compact, column, n)
+        n = _add_block(J, 21, 6, mount_at + 6 * camera, sign, own, compact, column, n)
+    return n
+
+
+@kernel
 def visual_terms(
     x: Array, lin: Array, motion: Array, models: Ints, params: Array, mount: Array, mount_lin: Array,
-    offset_s: float, base: Array, landmark: Array, start: Ints, frame: Ints, camera: Ints, px: Array,
+    offset_s: float, base: Array, landmark: Array, start: Ints, frame: Ints, camera: Ints, before_row: Ints, px: Array,
     sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, shift_s: Array, active: Bools, robust: bool,
     before: Array, usual_inv_depth: float, pose_at: int, mount_at: int, offset_at: int,
     H: Array, g: Array, V_out: Array, g_landmark: Array, W: Array, chi2: Array,
@@ -80,8 +122,12 @@ def visual_terms(
     Rci, pci, Rcj, pcj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     Lci, lci, Lcj, lcj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     here, place, lens = np.empty((3, 3)), np.empty(3), np.empty(params.shape[1])
-    r, E, J = np.zeros(3), np.empty((2, 3)), np.empty((3, 27))
-    compact, column = np.zeros((3, 26)), np.empty(26, np.int64)
+    most = 1
+    for m in range(len(start) - 1):
+        most = max(most, start[m + 1] - start[m])
+    r_all, J_all, good = np.zeros((most, 3)), np.zeros((most, 3, 28)), np.zeros(most, np.bool_)
+    r, E, r_own, J_own, J = np.zeros(3), np.empty((2, 3)), np.zeros(3), np.empty((3, 27)), np.zeros((3, 28))
+    compact, column, J_landmark = np.zeros((3, 40)), np.empty(40, np.int32), np.empty((3, 3))
     still = np.zeros((mount.shape[0], 6))
     V_out[:] = 0.0
     g_landmark[:] = 0.0
@@ -100,6 +146,7 @@ def visual_terms(
             for b in range(3):
                 here[a, b] = base[m, a, b]
         for o in range(first, start[m + 1]):
+            k, back = o - first, before_row[o] - first
             j, cj = frame[o], camera[o]
             tau_j = offset_s + shift_s[o]
             load_pose(x, j, motion, tau_j, Rj, pj)
@@ -110,19 +157,43 @@ def visual_terms(
                 lens[a] = params[cj, a]
             rows = inverse_depth_residual(
                 models[cj], lens, Ri, pi, Rci, pci, Rj, pj, Rcj, pcj, here, place,
-                px[o, 0], px[o, 1], sigma_px[o], inv_depth[o], sigma_inv_depth[o], r,
+                px[o, 0], px[o, 1], 1.0, inv_depth[o], sigma_inv_depth[o], r_own,
             )  # fmt: skip
+            if rows > 0 and not inverse_depth_jacobian(
+                models[cj], lens, Li, li, Lci, lci, Lj, lj, Lcj, lcj, here, place,
+                1.0, inv_depth[o], sigma_inv_depth[o], E, J_own,
+            ):  # fmt: skip
+                rows = 0
+            good[k] = rows > 0
+            if rows > 0:
+                if j != anchor and tau_i != 0.0:
+                    _turned_back(J_own, 0, motion, anchor, tau_i)
+                if j != anchor and tau_j != 0.0:
+                    _turned_back(J_own, 6, motion, j, tau_j)
+                for row in range(3):
+                    r_all[k, row] = r_own[row]
+                    for a in range(27):
+                        J_all[k, row, a] = J_own[row, a]
+                if offset_at >= 0:
+                    for row in range(3):
+                        s = 0.0
+                        for a in range(3):
+                            s += J_own[row, a] * motion[anchor, a] + J_own[row, 3 + a] * motion[anchor, 3 + a]
+                            s += J_own[row, 6 + a] * motion[j, a] + J_own[row, 9 + a] * motion[j, 3 + a]
+                        J_all[k, row, 27] = s
+            if before_row[o] >= 0 and not good[back]:
+                rows = 0
             value = weight = 0.0
             bound = CHI2_PX_DEPTH if inv_depth[o] > 0.0 else CHI2_PX
+            scale = 1.0 / sigma_px[o]
             if rows > 0:
+                r[0], r[1], r[2] = scale * r_all[k, 0], scale * r_all[k, 1], r_all[k, 2]
+                if before_row[o] >= 0:
+                    r[0] -= scale * r_all[back, 0]
+                    r[1] -= scale * r_all[back, 1]
                 chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
                 value, weight = fading(chi2[o], bound) if robust else (chi2[o], 1.0)
-                if not inverse_depth_jacobian(
-                    models[cj], lens, Li, li, Lci, lci, Lj, lj, Lcj, lcj, here, place,
-                    sigma_px[o], inv_depth[o], sigma_inv_depth[o], E, J,
-                ):  # fmt: skip
-                    rows = 0
-            if rows == 0:
+            else:
                 chi2[o] = math.inf
             if not active[o]:
                 continue
@@ -133,59 +204,43 @@ def visual_terms(
             cost += value
             if before[o] < math.inf:
                 comparable += value
-            n = 0
-            if j != anchor:
-                if tau_i != 0.0:
-                    _turned_back(J, 0, motion, anchor, tau_i)
-                if tau_j != 0.0:
-                    _turned_back(J, 6, motion, j, tau_j)
-                for a in range(6):
-                    column[a], column[6 + a] = pose_at + 6 * anchor + a, pose_at + 6 * j + a
-                for row in range(3):
-                    for a in range(12):
-                        compact[row, a] = J[row, a]
-                n = 12
-            # at the anchor's own pixel neither poses nor mountings have a say
-            if mount_at >= 0 and o != first:
-                low, high = min(ci, cj), max(ci, cj)
-                for a in range(6):
-                    column[n + a] = mount_at + 6 * low + a
-                    for row in range(3):
-                        compact[row, n + a] = J[row, (15 if low == ci else 21) + a]
-                        if low == high:
-                            compact[row, n + a] += J[row, 21 + a]
-                n += 6
-                if low != high:
-                    for a in range(6):
-                        column[n + a] = mount_at + 6 * high + a
-                        for row in range(3):
-                            compact[row, n + a] = J[row, (15 if high == ci else 21) + a]
-                    n += 6
-            if offset_at >= 0 and j != anchor:
-                column[n] = offset_at
-                for row in range(3):
-                    s = 0.0
+            for row in range(3):
+                for a in range(28):
+                    J[row, a] = J_all[k, row, a]
+                for a in range(3):
+                    J_landmark[row, a] = J[row, 12 + a]
+            n = _add_sighting(J, True, 1.0, j, anchor, cj, ci, pose_at, mount_at, offset_at, compact, column, 0)
+            if before_row[o] >= 0:
+                for row in range(2):
+                    for a in range(28):
+                        J[row, a] = J_all[back, row, a]
                     for a in range(3):
-                        s += compact[row, a] * motion[anchor, a] + compact[row, 3 + a] * motion[anchor, 3 + a]
-                        s += compact[row, 6 + a] * motion[j, a] + compact[row, 9 + a] * motion[j, 3 + a]
-                    compact[row, n] = s
-                n += 1
+                        J_landmark[row, a] -= J[row, 12 + a]
+                n = _add_sighting(
+                    J, False, -1.0, frame[o - k + back], anchor, camera[o - k + back], ci, pose_at, mount_at,
+                    offset_at, compact, column, n,
+                )  # fmt: skip
+            for row in range(2):
+                for a in range(n):
+                    compact[row, a] *= scale
+                for a in range(3):
+                    J_landmark[row, a] *= scale
             for a in range(n):
                 j0, j1, j2 = weight * compact[0, a], weight * compact[1, a], weight * compact[2, a]
                 at = column[a]
                 g[at] += j0 * r[0] + j1 * r[1] + j2 * r[2]
-                for b in range(a, n):
-                    H[at, column[b]] += j0 * compact[0, b] + j1 * compact[1, b] + j2 * compact[2, b]
+                for b in range(n):
+                    if column[b] >= at:
+                        H[at, column[b]] += j0 * compact[0, b] + j1 * compact[1, b] + j2 * compact[2, b]
                 at -= pose_at
-                W[m, 0, at] += j0 * J[0, 12] + j1 * J[1, 12] + j2 * J[2, 12]
-                W[m, 1, at] += j0 * J[0, 13] + j1 * J[1, 13] + j2 * J[2, 13]
-                W[m, 2, at] += j0 * J[0, 14] + j1 * J[1, 14] + j2 * J[2, 14]
+                for b in range(3):
+                    W[m, b, at] += j0 * J_landmark[0, b] + j1 * J_landmark[1, b] + j2 * J_landmark[2, b]
             slot = 0
             for a in range(3):
-                j0, j1, j2 = weight * J[0, 12 + a], weight * J[1, 12 + a], weight * J[2, 12 + a]
+                j0, j1, j2 = weight * J_landmark[0, a], weight * J_landmark[1, a], weight * J_landmark[2, a]
                 g_landmark[m, a] += j0 * r[0] + j1 * r[1] + j2 * r[2]
                 for b in range(a + 1):
-                    V_out[m, slot] += j0 * J[0, 12 + b] + j1 * J[1, 12 + b] + j2 * J[2, 12 + b]
+                    V_out[m, slot] += j0 * J_landmark[0, b] + j1 * J_landmark[1, b] + j2 * J_landmark[2, b]
                     slot += 1
         unusual = (landmark[m, 2] - usual_inv_depth) / SIGMA_INV_DEPTH
         V_out[m, 5] += 1.0 / (SIGMA_INV_DEPTH * SIGMA_INV_DEPTH)
@@ -205,8 +260,8 @@ def state_terms(
     still_sigma_m: float,
     prior_at: Ints, prior_H: Array, prior_g: Array, delta: Array,
     pose_at: int, H: Array, g: Array,
-) -> float:  # fmt: skip
-    """Add the IMU between frames, standstill and the prior; returns their cost.
+) -> tuple[float, float]:  # fmt: skip
+    """Add the IMU between frames, standstill and the prior; returns their cost, and that of the IMU alone.
 
     measured (F - 1, 76), whiten (F - 1, 15, 15) : L^-1 of the covariance's factor; use (F - 1,)
     still_sigma (F,) m/s : of a velocity of zero, 0 = moving; still_sigma_m : of the way between two such frames
@@ -246,6 +301,7 @@ def state_terms(
                 for e in range(30):
                     if column[e] >= at:
                         H[at, column[e]] += scale * white[a, e]
+    imu_cost = cost
     for f in range(F):
         if still_sigma[f] > 0.0:
             information = 1.0 / (still_sigma[f] * still_sigma[f])
@@ -273,7 +329,7 @@ def state_terms(
                 H[prior_at[i], prior_at[j]] += prior_H[i, j]
         g[prior_at[i]] += prior_g[i] + pull
         cost += delta[i] * (pull + 2.0 * prior_g[i])
-    return cost
+    return cost, imu_cost
 
 
 @kernel

@@ -25,12 +25,16 @@ NO_COVARIANCE = 1e-6  # on every diagonal: what no factor holds stays where it i
 
 @dataclass(eq=False)
 class Sightings:
-    """Observations sorted by track, then frame, then camera. start (M + 1,) : rows of each landmark, track (M,)"""
+    """Observations sorted by track, then frame, then camera. start (M + 1,) : rows of each landmark, track (M,)
+
+    before (N,) : the row that one is held against, -1 = none; sigma_px (N,) is that of the difference
+    """
 
     track: AnyArray
     start: Ints
     frame: Ints
     camera: Ints
+    before: Ints
     px: Array
     sigma_px: Array
     inv_depth: Array
@@ -84,6 +88,7 @@ class Linear:
     W: Array
     chi2: Array
     tag_chi2: Array
+    imu_chi2: float = 0.0
     cost: float = 0.0
     comparable: float = 0.0
 
@@ -221,13 +226,13 @@ class Problem:
         offset = float(x.offset_s[0])
         out.cost, out.comparable = kernels.visual_terms(
             x.frames, frames, self.motion, self.models, self.params, x.mounts, mounts, offset, self.base,
-            x.landmarks, s.start, s.frame, s.camera, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
-            self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth,
+            x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth,
+            s.shift_s, self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth,
             self.pose_at, self.mount_at, self.offset_at,
             out.H, out.g, out.V, out.g_landmark, out.W, out.chi2,
         )  # fmt: skip
         delta = self.offsets(x)[self.prior_at]
-        rest = kernels.state_terms(
+        rest, out.imu_chi2 = kernels.state_terms(
             x.frames, frames, self.measured, self.whiten, self.use_imu, self.still_sigma, self.still_sigma_m,
             self.prior_at, self.prior.H, self.prior.g, delta, self.pose_at, out.H, out.g,
         )  # fmt: skip

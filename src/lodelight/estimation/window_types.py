@@ -72,6 +72,9 @@ class Observations:
     """What the front end saw in one frame, a row per track and camera.
 
     track (N,) int64 ids; camera (N,) index in the rig; px (N, 2), sigma_px (N,) raw pixels
+    wander_px2 (N,) : variance that a track followed from frame to frame has gathered, up to this frame, since any
+        time: a row is then held against the last one of its track, see the derivations; default (NaN) the noise of
+        every row is its own
     inv_depth, sigma_inv_depth (N,) 1/m along z of that camera, inv_depth 0 = not measured; default none
     dt_s (N,) : exposure of the row after the frame's stamp (rolling shutter); default 0
     """
@@ -83,6 +86,7 @@ class Observations:
     inv_depth: AnyArray | None = None
     sigma_inv_depth: AnyArray | None = None
     dt_s: AnyArray | None = None
+    wander_px2: AnyArray | None = None
 
     @staticmethod
     def none() -> Observations:
@@ -126,6 +130,7 @@ class Solution:
     """ok False : the equations were not definite or not finite; the window is where it was
 
     outliers : tracks whose sighting in the newest frame was rejected
+    imu_chi2 : of the IMU between the frames, per degree of freedom: 1 or less where it agrees with the images
     tag_chi2 : by id, of 8 degrees of freedom, of the newest frame's sightings: against the window before them where it
         was tested, else at the result
     tag_rejected : ids of those that were left out
@@ -137,6 +142,7 @@ class Solution:
     n_observations: int
     n_inliers: int
     outliers: AnyArray
+    imu_chi2: float = 0.0
     tag_chi2: dict[str, float] = field(default_factory=dict)
     tag_rejected: tuple[str, ...] = ()
 

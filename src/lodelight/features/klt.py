@@ -20,13 +20,15 @@ from lodelight.features.depth import depth_at
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.triangulate import triangulate_pairs
-from lodelight.geometry.two_view import fit_two_view, turn_between
+from lodelight.geometry.two_view import epipolar_noise, fit_two_view, turn_between
 from lodelight.messages import Frame
 from lodelight.rig import CameraSpec, Rig
 from lodelight.types import AnyArray, Array, ArrayF32, Bools, Bytes, Ints
 
 UNAIDED_SIGMA = 0.01  # rad: of a turn by the images alone, which takes part of the translation for turning
 STEREO_BOUND = 2.0  # what calibration adds to the noise across the epipolar plane
+LEAST_STEP_PX = 0.03  # no patch is followed better
+LENS_PATCHES, LENS_REACH_PX = 12, 200.0  # a track that moved so far is off by something else
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class KltConfig:
     min_contrast : least smaller eigenvalue of a corner's gradients, in squared grey values a pixel: below is noise
     equalize : contrast limit of the local equalisation, 0 = none
     sigma_px : noise of a track; bound : outlier bound of the common motion in units of it
+    wander : over ten frames and more a track leaves its point by so many times what single steps would add up to,
+        measured on rendered images (docs/inertial.md)
+    lens_px : what a lens model is off by, alike within patches of the image, of which there are LENS_PATCHES
     """
 
     tracks: int = 180
@@ -50,6 +55,8 @@ class KltConfig:
     equalize: float = 3.0
     sigma_px: float = 0.5
     bound: float = 3.0
+    wander: float = 1.5
+    lens_px: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +67,8 @@ class Tracks:
     px : (N, 2) float32, raw pixels; ray : (N, 3) unit rays, camera 0
     px_right : (N, 2) float32, raw pixels of camera 1, NaN where it was not found there
     inv_depth, sigma_inv_depth : (N,) float64 1/m along camera 0's z, 0 = not measured
+    step_px, right_px : noise of a step from the last frame, and from camera 0 to camera 1, as this frame's tracks show
+    wander_px2 : variance of how far a track followed through all frames so far has left its point
     """
 
     t_ns: int
@@ -70,6 +79,9 @@ class Tracks:
     px_right: ArrayF32
     inv_depth: Array
     sigma_inv_depth: Array
+    step_px: float = LEAST_STEP_PX
+    right_px: float = LEAST_STEP_PX
+    wander_px2: float = 0.0
 
     def __len__(self) -> int:
         return len(self.id)
@@ -85,9 +97,9 @@ class Tracks:
         return found
 
     def take(self, index: AnyArray) -> Tracks:
-        return Tracks(
-            self.t_ns, self.id[index], self.age[index], self.px[index], self.ray[index], self.px_right[index],
-            self.inv_depth[index], self.sigma_inv_depth[index],
+        return replace(
+            self, id=self.id[index], age=self.age[index], px=self.px[index], ray=self.ray[index],
+            px_right=self.px_right[index], inv_depth=self.inv_depth[index], sigma_inv_depth=self.sigma_inv_depth[index],
         )  # fmt: skip
 
 
@@ -124,6 +136,8 @@ class KltTracker:
         self._next_id = 0
         self._last: Bytes | None = None
         self._tracks: Tracks | None = None
+        self._step_px = self.config.sigma_px
+        self._wander_px2 = 0.0
         self._drift = np.zeros((0, 2), np.float32)  # of each track, px: its last flow beyond what turning explains
 
     @property
@@ -146,6 +160,8 @@ class KltTracker:
         else:
             tracks, drift = self._follow(image, frame.t_ns, R_now_last, sigma_rotation)
         followed = len(tracks)
+        self._wander_px2 += (self.config.wander * self._step_px) ** 2 + self._lens_px2(followed)
+        tracks = replace(tracks, step_px=self._step_px, wander_px2=self._wander_px2)
         tracks = _with_new(tracks, self._new_corners(image, tracks), self.camera, self._next_id)
         self._next_id += len(tracks) - followed
         usual = np.median(drift, axis=0) if followed else np.zeros(2)
@@ -170,6 +186,12 @@ class KltTracker:
 
     # -- parts --------------------------------------------------------------------------------------------------
 
+    def _lens_px2(self, followed: int) -> float:
+        """What the lens adds to a track's wander in this frame. Tracks of one patch of the image share its error, and
+        together know no more than one of them: each is given as much more noise."""
+        share = min(self.flow.moved_px / LENS_REACH_PX, 1.0)
+        return 2.0 * self.config.lens_px**2 * share * max(followed / LENS_PATCHES, 1.0)
+
     def _equalized(self, image: Bytes) -> Bytes:
         return image if self._equalizer is None else np.asarray(self._equalizer.apply(image), np.uint8)
 
@@ -189,9 +211,10 @@ class KltTracker:
         sigma = self.config.sigma_px / self.camera.focal_px
         if R_now_last is None:
             R, sigma_rotation = turn_between(old.ray[keep], ray), UNAIDED_SIGMA
-        R, _, right, parallax = fit_two_view(
+        R, t, right, parallax = fit_two_view(
             old.ray[keep], ray, np.ascontiguousarray(R), sigma_rotation, sigma, self.config.bound, self._seed
         )
+        self._step_px = _noise_px(epipolar_noise(old.ray[keep], ray, R, t), self.camera, self._step_px)
         moved = float(np.median(np.linalg.norm(px[keep] - old.px[keep], axis=1))) if len(keep) else 0.0
         self.flow = Flow(R, parallax, moved, len(old), len(keep), int(np.count_nonzero(~right)))
         keep, ray = keep[right], ray[right]
@@ -251,12 +274,16 @@ class KltTracker:
             SE3.identity(), tracks.ray[rows], sigma, T.inverse(), ray[rows], sigma, max_relative_sigma=math.inf
         )
         rows, z = rows[good], xyz[good, 2]
+        noise = epipolar_noise(tracks.ray[rows], ray[rows], np.ascontiguousarray(T.R), T.t / np.linalg.norm(T.t))
         px_right, measured, sigmas = np.full_like(tracks.px, np.nan), np.zeros(len(tracks)), np.zeros(len(tracks))
         px_right[rows] = px[rows]
         measured[rows] = 1.0 / z
         # a pixel of disparity is focal length times baseline of inverse depth
         sigmas[rows] = math.sqrt(2.0) * self.config.sigma_px / (self.camera.focal_px * float(np.linalg.norm(T.t)))
-        return replace(tracks, px_right=px_right, inv_depth=measured, sigma_inv_depth=sigmas)
+        right_px = math.hypot(
+            self.config.wander * _noise_px(noise, self.camera, self.config.sigma_px), self.config.lens_px
+        )
+        return replace(tracks, px_right=px_right, inv_depth=measured, sigma_inv_depth=sigmas, right_px=right_px)
 
     def _expected_inv_depth(self, tracks: Tracks) -> Array:
         """(N,) 1/m: as last measured, or else the median of those that were."""
@@ -269,6 +296,10 @@ class KltTracker:
         known = last.inv_depth[row_last] > 0
         out[row[known]] = last.inv_depth[row_last[known]]
         return out
+
+
+def _noise_px(angle: float, camera: Camera, usual: float) -> float:
+    return max(angle * camera.focal_px, LEAST_STEP_PX) if math.isfinite(angle) else usual
 
 
 def _check_size(image: Bytes, spec: CameraSpec) -> None:
@@ -285,11 +316,11 @@ def _with_new(old: Tracks, fresh: ArrayF32, camera: Camera, first_id: int) -> Tr
     ray, real = camera.unproject(fresh.astype(np.float64))
     fresh, ray = fresh[real], ray[real]
     n = len(fresh)
-    return Tracks(
-        old.t_ns, np.concatenate([old.id, np.arange(first_id, first_id + n)]),
-        np.concatenate([old.age, np.zeros(n, np.int32)]), np.concatenate([old.px, fresh]),
-        np.concatenate([old.ray, ray]), np.full((len(old) + n, 2), np.nan, np.float32),
-        np.zeros(len(old) + n), np.zeros(len(old) + n),
+    return replace(
+        old, id=np.concatenate([old.id, np.arange(first_id, first_id + n)]),
+        age=np.concatenate([old.age, np.zeros(n, np.int32)]), px=np.concatenate([old.px, fresh]),
+        ray=np.concatenate([old.ray, ray]), px_right=np.full((len(old) + n, 2), np.nan, np.float32),
+        inv_depth=np.zeros(len(old) + n), sigma_inv_depth=np.zeros(len(old) + n),
     )  # fmt: skip
 
 

@@ -34,6 +34,9 @@ LINEAR_REPETITIONS = 4
 MOST_BEHIND = 0.5  # share of the landmarks
 BEHIND = "most landmarks would lie behind the camera"
 HUBER = 1.5  # of a ray's angle, in units of its noise
+# One camera in slow motion takes twenty steps and more from the linear answer, which takes a scene for smaller than it
+# is, to the right one; a start on the way there is wrong by much more than its covariance says.
+MOST_STEPS, SETTLED = 60, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +128,6 @@ def align(
     T_body_cam: Sequence[SE3],
     sigma_ray: float,
     sigma_bias: tuple[float, float] = (0.01, 0.1),
-    iterations: int = 8,
 ) -> Alignment | str:
     """The alignment, or why there is none.
 
@@ -139,7 +141,16 @@ def align(
         return started
     if started[2] > MOST_BEHIND:
         return BEHIND
-    return problem.refined(*started, iterations)
+    # A scene turned inside out, with the motion turned about, nearly fits as well: both ways are tried.
+    x = started[0]
+    turned = np.concatenate([x[:3], -x[3:6], x[6:]])
+    return _better(problem.refined(*started), problem.refined(turned, *problem.landmarks(turned)))
+
+
+def _better(a: Alignment | str, b: Alignment | str) -> Alignment | str:
+    if isinstance(a, str) or isinstance(b, str):
+        return b if isinstance(a, str) else a
+    return a if a.rms <= b.rms else b
 
 
 @dataclass(eq=False)
@@ -156,9 +167,7 @@ class _Problem:
         m, rows, start = self.motions, self.rows, self.rows.start
         distance = np.ones(len(rows.frame))
         x, X, behind = np.zeros(9), np.zeros((len(start) - 1, 3)), 0.0
-        along = np.zeros(len(rows.frame))
-        measured = rows.inv_depth > 0
-        along[measured] = (self.sigma_ray * rows.inv_depth[measured] ** 2 / rows.sigma_inv_depth[measured]) ** 2
+        along = self._along()
         for _ in range(LINEAR_REPETITIONS):
             H, b = linear_equations(
                 m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam,
@@ -175,24 +184,45 @@ class _Problem:
             )  # fmt: skip
         return x, X, behind
 
-    def refined(self, x: Array, X: Array, behind: float, iterations: int) -> Alignment | str:
-        """Gauss-Newton (Levenberg-Marquardt) from the linear answer on."""
+    def landmarks(self, x: Array) -> tuple[Array, float]:
+        """Those that x (9,) makes of the sightings, and the share behind."""
+        m, rows, start = self.motions, self.rows, self.rows.start
+        X, along = np.zeros((len(start) - 1, 3)), self._along()
+        behind = linear_landmarks(
+            m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam, rows.frame, rows.camera, rows.ray, rows.inv_depth,
+            along, start, x, np.ones(len(rows.frame)), X,
+        )  # fmt: skip
+        return X, behind
+
+    def _along(self) -> Array:
+        """(N,) weight of a measured depth along its ray, beside 1 across."""
+        rows, measured = self.rows, self.rows.inv_depth > 0
+        along = np.zeros(len(rows.frame))
+        along[measured] = (self.sigma_ray * rows.inv_depth[measured] ** 2 / rows.sigma_inv_depth[measured]) ** 2
+        return along
+
+    def refined(self, x: Array, X: Array, behind: float) -> Alignment | str:
+        """Gauss-Newton (Levenberg-Marquardt) from the linear answer on, until it has settled."""
         state = _Guess(x[:3], x[3:6], self.motions.bias_gyro.copy(), self.motions.bias_accel + x[6:], X)
         best = self._equations(state, 1e-4)
         if best.used < 2 * N:
             return f"{best.used} rays agree with one motion, {2 * N} are needed"
         damping = 1e-4
-        for _ in range(iterations):
+        for _ in range(MOST_STEPS):
             trial_state = self._stepped(state, best)
             trial = self._equations(trial_state, damping)
             if trial.cost < best.cost:
-                done = best.cost - trial.cost < 1e-4 * best.cost
+                done = best.cost - trial.cost < SETTLED * best.cost
                 state, best, damping = trial_state, trial, max(0.1 * damping, 1e-8)
                 if done:
                     break
+            elif damping > 1.0:  # no way down is left
+                break
             else:
                 damping *= 10.0
                 best = self._equations(state, damping)
+        else:
+            return f"images and IMU have not settled on one motion after {MOST_STEPS} steps"
         return self._result(state, self._equations(state, 1e-10), behind)
 
     def _equations(self, at: _Guess, damping: float) -> _Linearized:

@@ -38,6 +38,7 @@ class StartConfig:
     min_tracks : landmarks seen from the first to the last image
     min_parallax_deg : of them, what one camera alone needs
     max_scale, max_tilt_deg, max_velocity : standard deviations above which it is too early; m/s
+    max_px : what is left of the rays on average, above which images and IMU do not agree on one motion
     sigma_px : of a ray in the alignment. Several times a track's own: errors of one track are alike from frame to
         frame, and the IMU's own noise is not modelled there
     bias_gyro, bias_accel : deviations of the biases before anything is known, rad/s and m/s^2
@@ -55,6 +56,7 @@ class StartConfig:
     max_scale: float = 0.06
     max_tilt_deg: float = 2.0
     max_velocity: float = 0.15
+    max_px: float = 0.8
     sigma_px: float = 2.0
     bias_gyro: float = 0.05
     bias_accel: float = 0.1
@@ -214,7 +216,7 @@ class Starter:
             self._refuse_turned_sign(rows, sigma_ray, bias)
         if isinstance(found, str):
             return found
-        missing = self._missing(found)
+        missing = self._missing(found, motions)
         return missing or self._started(found)
 
     def _rows(self) -> Rows:
@@ -288,13 +290,19 @@ class Starter:
                 best = max(best, float(np.median(np.linalg.norm(np.cross(ray_a[a], turned), axis=1))))
         return math.degrees(best)
 
-    def _missing(self, found: Alignment) -> str:
+    def _missing(self, found: Alignment, motions: list[Preintegration]) -> str:
         c = self.config
         if found.inliers < 0.6 * found.n:
             return f"{found.inliers} of {found.n} sightings agree with the IMU; check the camera's pose and the clocks"
+        left_px = found.rms * c.sigma_px
+        if left_px > c.max_px:
+            return (
+                f"images and IMU differ by {left_px:.2f} px, {c.max_px:.2f} at most; check the camera's pose and the "
+                "clocks"
+            )
         shares = [
             (
-                0.0 if self.metric else found.sigma_scale,
+                0.0 if self.metric else math.hypot(found.sigma_scale, _drift(found, motions)),
                 c.max_scale,
                 "scale known to {:.0%}, {:.0%} are needed: accelerate",
             ),
@@ -331,6 +339,15 @@ class Starter:
             "in motion", why, states, found.sigma_tilt, float(sigma[2:5].max()), float(sigma[5:8].max()),
             float(sigma[8:].max()),
         )  # fmt: skip
+
+
+def _drift(found: Alignment, motions: list[Preintegration]) -> float:
+    """What the noise of the IMU alone moves the farthest position by, as a share of the way there."""
+    far = int(np.argmax(np.linalg.norm(found.p, axis=1)))
+    if far == 0:
+        return math.inf
+    along = found.p[far] / found.path_m
+    return math.sqrt(float(along @ motions[far - 1].covariance[3:6, 3:6] @ along)) / found.path_m
 
 
 def upright(down: Array) -> Array:

@@ -34,10 +34,11 @@ class OdometryConfig:
     """few_tracks : in agreement with the window, below which a frame is degraded
     blind_s : without them for so long, and the IMU alone is believed no more
     most_speed m/s, most_bias_gyro rad/s, most_bias_accel m/s^2 : a window that believes more has failed
-    start_iterations : of the first solution; sigma_px : noise of a track in the window
+    most_imu_chi2 : per degree of freedom, of the IMU in a window that is believed; likewise
+    start_iterations : of the first solution
     still_px, still_gyro, still_accel : a frame whose tracks moved and whose IMU deviates by less has no velocity; px,
         rad/s, m/s^2
-    vibration : share of the accelerometer's fast changes that counts as white noise (imu/vibration.py)
+    vibration : share of the fast changes of the IMU that counts as white noise (imu/vibration.py)
     """
 
     few_tracks: int = 15
@@ -45,8 +46,8 @@ class OdometryConfig:
     most_speed: float = 30.0
     most_bias_gyro: float = 0.5
     most_bias_accel: float = 2.0
+    most_imu_chi2: float = 4.0
     start_iterations: int = 10
-    sigma_px: float = 0.7
     still_px: float = 0.35
     still_gyro: float = 0.02
     still_accel: float = 0.25
@@ -54,7 +55,7 @@ class OdometryConfig:
     klt: KltConfig = field(default_factory=KltConfig)
     start: StartConfig = field(default_factory=StartConfig)
     keyframes: KeyframeRule = field(default_factory=KeyframeRule)
-    window: WindowConfig = field(default_factory=lambda: WindowConfig(keyframes=12))
+    window: WindowConfig = field(default_factory=WindowConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +180,13 @@ class InertialOdometry:
         if m:  # what two cameras say is said by their pixels
             inv_depth, sigma = np.zeros(n), np.zeros(n)
         none = np.zeros(m)
+        noise = np.concatenate([np.full(n, tracks.step_px), np.full(m, tracks.right_px)])
         return Observations(
             np.concatenate([tracks.id, tracks.id[right]]),
             np.concatenate([np.zeros(n, np.int32), np.ones(m, np.int32)]),
             np.concatenate([tracks.px, tracks.px_right[right]]).astype(np.float64),
-            np.full(n + m, self.config.sigma_px),
-            np.concatenate([inv_depth, none]), np.concatenate([sigma, none]),
+            noise, np.concatenate([inv_depth, none]), np.concatenate([sigma, none]),
+            wander_px2=np.full(n + m, tracks.wander_px2),
         )  # fmt: skip
 
     def _keyframe_reason(self, tracks: Tracks, T_map_body: SE3) -> str:
@@ -272,6 +274,8 @@ class InertialOdometry:
         gyro, accel = float(np.linalg.norm(state.bias_gyro)), float(np.linalg.norm(state.bias_accel))
         if not (gyro < c.most_bias_gyro and accel < c.most_bias_accel):
             return f"the window believes in biases of {gyro:.2f} rad/s and {accel:.2f} m/s^2"
+        if not solution.imu_chi2 < c.most_imu_chi2:
+            return f"images and IMU contradict each other (chi-square {solution.imu_chi2:.1f} per degree of freedom)"
         return ""
 
     def _blind(self, inliers: int, t_ns: int) -> str:
