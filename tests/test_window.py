@@ -228,7 +228,7 @@ def test_standing_still_holds_the_velocity_and_finds_the_gyro_bias():
 
 
 def test_a_wrong_mounting_and_a_clock_that_is_off_are_found():
-    made = scene(8, gait="hand", duration_s=14.0, rate_hz=10.0, cameras=2, tags=10)
+    made = scene(8, gait="walk", duration_s=14.0, rate_hz=10.0, cameras=2, tags=10)
     spec = made.rig.cameras[0]
     off = np.radians([0.8, -0.6, 0.5])
     wrong = [
