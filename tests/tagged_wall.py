@@ -72,12 +72,12 @@ def frame(wall: np.ndarray, T_wall_cam: SE3, t_ns: int) -> Frame:
     return Frame(t_ns, (np.clip(image, 0, 255).astype(np.uint8),), along.astype(np.float32))
 
 
-def write_walk(folder: Path, wall: np.ndarray, first: int, last: int) -> Path:
+def write_walk(folder: Path, wall: np.ndarray, first: int, last: int, step_ns: int = STEP_NS) -> Path:
     """A part of the walk past the wall, with its truth."""
     folders = write_sensors(folder, RIG)
     truth = folders["state_groundtruth_estimate0"]
     for k, T_wall_cam in list(enumerate(poses(N_POSES)))[first:last]:
-        seen = frame(wall, T_wall_cam, (k + 1) * STEP_NS)
+        seen = frame(wall, T_wall_cam, (k + 1) * step_ns)
         append_image(folders["cam0"], seen.t_ns, seen.images[0])
         append_image(folders["depth0"], seen.t_ns, stored_depth(seen.depth, RIG.depth))
         still = np.zeros((1, 3))
