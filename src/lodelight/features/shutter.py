@@ -11,14 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from lodelight.compiled import kernel
 from lodelight.features.features import Features
-from lodelight.geometry.cameras import project_points
+from lodelight.geometry.cameras import project_jacobian, project_points
 from lodelight.rig import CameraSpec
 from lodelight.types import AnyArray, Array
 
 STILL = np.zeros(6)
 BEYOND = 0.1  # of the image's width: so far outside of it a straightened corner may lie, as the first row never saw it
-STEP = 1e-4  # rad or m, of the central differences
 UNMEASURED = 1e-6  # information that keeps the system solvable where corners leave a direction open
 
 
@@ -65,12 +65,10 @@ class Shutter:
         expected (3,) rad/s, covariance (3, 3) : what is known of it without the rows
         Linear in the turn, and in the pose, which is free beside it: a turn moves later rows farther.
         """
-        predicted = self._project(xyz_cam)
-        turned, shifted = self._derivatives(xyz_cam)
-        delayed = self._delay_s(px)[:, None, None] * turned
-        A = (np.concatenate([delayed, turned, shifted], axis=2) / sigma_px[:, None, None]).reshape(-1, 9)
-        r = ((predicted - px) / sigma_px[:, None]).reshape(-1)
-        H, g = A.T @ A + UNMEASURED * np.eye(9), A.T @ r
+        H, g = _turn_system(
+            self.camera.model, self.camera.params, self.row_time_s, np.asarray(px, np.float64), sigma_px, xyz_cam
+        )
+        H += UNMEASURED * np.eye(9)
         information = np.linalg.inv(covariance)
         H[:3, :3] += information
         g[:3] += information @ expected
@@ -81,27 +79,46 @@ class Shutter:
         """How far a turn moves the last row, nearly."""
         return float(np.linalg.norm(twist[:3])) * self.readout_s * self.camera.focal_px
 
-    def _derivatives(self, xyz_cam: Array) -> tuple[Array, Array]:
-        """(N, 2, 3) of pixels by a turn of the points about the camera, px/rad, and by a shift of them, px/m."""
-        turned, shifted = np.empty((2, len(xyz_cam), 2, 3))
-        for axis in range(3):
-            step = np.zeros(3)
-            step[axis] = STEP
-            for out, by in ((turned, np.cross(step, xyz_cam)), (shifted, step)):
-                ahead, behind = self._project(xyz_cam + by), self._project(xyz_cam - by)
-                out[:, :, axis] = (ahead - behind) / (2.0 * STEP)
-        return turned, shifted
-
-    def _project(self, xyz_cam: Array) -> Array:
-        return project_points(self.camera.model, self.camera.params, np.ascontiguousarray(xyz_cam))[0]
-
     def _delay_s(self, px: AnyArray) -> Array:
         return self.row_time_s * px[:, 1].astype(np.float64)
 
 
+@kernel
 def _turned(vectors: Array, by: Array) -> Array:
     """Vectors (N, 3), each turned by its own small rotation vector: Rodrigues to third order."""
-    first = np.cross(by, vectors)
-    second = np.cross(by, first)
-    out: Array = vectors + first + 0.5 * second + np.cross(by, second) / 6.0
+    out = np.empty_like(vectors)
+    for i in range(len(vectors)):
+        x, y, z = vectors[i]
+        a, b, c = by[i]
+        out[i] = vectors[i]
+        for share in (1.0, 0.5, 1.0 / 3.0):
+            x, y, z = share * (b * z - c * y), share * (c * x - a * z), share * (a * y - b * x)
+            out[i, 0] += x
+            out[i, 1] += y
+            out[i, 2] += z
     return out
+
+
+@kernel
+def _turn_system(
+    model: int, params: Array, row_time_s: float, px: Array, sigma_px: Array, xyz_cam: Array
+) -> tuple[Array, Array]:
+    """H (9, 9) and g (9,) of pixels by the turn per second, by a turn and by a shift of the points, camera frame."""
+    H, g = np.zeros((9, 9)), np.zeros(9)
+    E, A = np.zeros((2, 3)), np.zeros((2, 9))
+    for i in range(len(px)):
+        x, y, z = xyz_cam[i]
+        u, v, _ = project_jacobian(model, params, x, y, z, E)
+        w, delay_s = 1.0 / sigma_px[i], row_time_s * px[i, 1]
+        for k in range(2):
+            e0, e1, e2 = w * E[k, 0], w * E[k, 1], w * E[k, 2]
+            A[k, 3], A[k, 4], A[k, 5] = e2 * y - e1 * z, e0 * z - e2 * x, e1 * x - e0 * y  # of X + axis x X
+            A[k, 6], A[k, 7], A[k, 8] = e0, e1, e2
+            for j in range(3):
+                A[k, j] = delay_s * A[k, 3 + j]
+        r0, r1 = w * (u - px[i, 0]), w * (v - px[i, 1])
+        for a in range(9):
+            g[a] += A[0, a] * r0 + A[1, a] * r1
+            for b in range(9):
+                H[a, b] += A[0, a] * A[0, b] + A[1, a] * A[1, b]
+    return H, g

@@ -66,6 +66,32 @@ def fuse(
 
 
 @kernel
+def join(
+    rows: Ints, points: Ints, point: Ints, next_row: Ints, keyframe: Ints, head: Ints, n_obs: Ints, n_visible: Ints,
+    n_found: Ints, replaced_by: Ints, alive: Bools,
+) -> None:  # fmt: skip
+    """Each feature row sees a point: one that saw none is linked; of two points, the one seen less becomes the other.
+
+    A point that was replaced on the way is followed.
+    """
+    for i in range(len(rows)):
+        row, new = rows[i], points[i]
+        while replaced_by[new] >= 0:
+            new = replaced_by[new]
+        old = point[row]
+        if old < 0:
+            if alive[new]:
+                point[row] = new
+                next_row[row] = head[new]
+                head[new] = row
+                n_obs[new] += 1
+        elif old != new:
+            if n_obs[old] > n_obs[new]:
+                old, new = new, old
+            fuse(old, new, point, next_row, keyframe, head, n_obs, n_visible, n_found, replaced_by, alive)
+
+
+@kernel
 def unlink(rows: Ints, point: Ints, next_row: Ints, head: Ints, n_obs: Ints, alive: Bools) -> None:
     for row in rows:
         m = _unlink_one(row, point, next_row, head, n_obs)

@@ -219,16 +219,8 @@ def fuse_into(map: Map, keyframe: int, points: Ints, orb: OrbConfig, radius_px: 
         sight.px, radius_px * orb.scale(sight.octave), (sight.octave - 1, sight.octave + 1),
         map.points.desc[sight.point], max_hamming=50,
     )  # fmt: skip
-    first = map.feature_range(keyframe).start
-    for i in np.flatnonzero(match >= 0):
-        row, new = first + int(match[i]), int(sight.point[i])
-        old = int(map.features.point[row])
-        if old < 0:
-            map.link(np.array([row]), np.array([new]))
-        elif map.points.n_obs[old] > map.points.n_obs[new]:
-            map.fuse_points(new, old)
-        else:
-            map.fuse_points(old, new)
+    found = match >= 0
+    map.join(map.feature_range(keyframe).start + match[found], sight.point[found])
 
 
 def adjust(

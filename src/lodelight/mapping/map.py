@@ -227,6 +227,14 @@ class Map:
             old, new, f.point, f.next, f.keyframe, p.head, p.n_obs, p.n_visible, p.n_found, p.replaced_by, p.alive
         )
 
+    def join(self, features: AnyArray, points: AnyArray) -> None:
+        """Feature rows see points; where one saw another point, the two become one."""
+        f, p = self.features, self.points
+        kernels.join(
+            np.asarray(features, np.int32), np.asarray(points, np.int32), f.point, f.next, f.keyframe,
+            p.head, p.n_obs, p.n_visible, p.n_found, p.replaced_by, p.alive,
+        )  # fmt: skip
+
     def refresh_points(self, points: AnyArray, scale_factor: float, n_levels: int) -> None:
         """Recompute descriptor (the medoid of its observations), normal and scale range of points."""
         f, p, k = self.features, self.points, self.keyframes
