@@ -136,8 +136,8 @@ def test_tight_lights_are_sightings_of_a_keyframe_at_the_time_of_their_rows():
 def test_lights_that_hang_elsewhere_are_named_and_no_others(fault):
     if fault == "moved":
         wrong = {"L8": LIGHTS[8].xyz + np.array([0.0, 1.0, 0.0])}
-    else:
-        wrong = {"L8": LIGHTS[13].xyz, "L13": LIGHTS[8].xyz}
+    else:  # 3.7 m apart
+        wrong = {"L8": LIGHTS[17].xyz, "L17": LIGHTS[8].xyz}
     known = tuple(replace(light, xyz=wrong.get(light.id, light.xyz)) for light in LIGHTS)
     loop = Loop(known=known).run()
     assert {event["light"] for event in loop.of("light_misplaced")} == set(wrong)

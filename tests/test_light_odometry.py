@@ -7,9 +7,9 @@ import pytest
 
 from lodelight.errors import CalibrationError, SourceError
 from lodelight.geometry.se3 import SE3, carried_covariance
-from lodelight.io.covariances import write_covariances
+from lodelight.io.covariances import covariance_from_ros, covariance_to_ros, write_covariances
 from lodelight.io.light_odometry import check_clock, read_light_odometry
-from lodelight.io.odometry_bag import TOPIC, covariance_from_ros, covariance_to_ros, read_odometry_bag, write_odometry
+from lodelight.io.odometry_bag import TOPIC, read_odometry_bag, write_odometry
 from lodelight.io.trajectories import write_tum
 from lodelight.messages import LightFix
 from lodelight.sim.rigs import standard
@@ -48,6 +48,7 @@ def test_a_ros_covariance_is_that_of_a_turn_about_fixed_axes():
 def test_a_bag_gives_back_what_was_written(tmp_path, name):
     made = [*fixes(), LightFix(START_NS + 10**9, None, np.full((6, 6), np.inf), why="one light only")]
     write_odometry(tmp_path / name, made)
+    write_odometry(tmp_path / name, made)  # replaces what is there
     assert {(r.frame_id, r.child_frame_id) for r in read_odometry_bag(tmp_path / name)} == {("world", "body")}
     for text in (str(tmp_path / name), f"{tmp_path / name}:{TOPIC}"):
         back = read_light_odometry(text, RIG)
@@ -55,7 +56,7 @@ def test_a_bag_gives_back_what_was_written(tmp_path, name):
         for a, b in zip(made, back, strict=False):
             np.testing.assert_allclose(b.T_world_body.matrix, a.T_world_body.matrix, atol=1e-12)
             np.testing.assert_allclose(b.covariance, a.covariance, atol=1e-14)
-    assert not list(tmp_path.glob(".odometry*"))
+    assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 def test_poses_of_the_light_camera_come_to_the_body(tmp_path):
@@ -67,13 +68,13 @@ def test_poses_of_the_light_camera_come_to_the_body(tmp_path):
         of_camera.append(
             replace(f, T_world_body=there, covariance=carried_covariance(f.T_world_body, f.covariance, there))
         )
-    write_odometry(tmp_path / "lights.mcap", of_camera, child_frame_id="light0")
+    write_odometry(tmp_path / "lights.mcap", of_camera, body="light0")
     for a, b in zip(made, read_light_odometry(str(tmp_path / "lights.mcap"), RIG), strict=True):
         np.testing.assert_allclose(b.T_world_body.matrix, a.T_world_body.matrix, atol=1e-12)
         np.testing.assert_allclose(b.covariance, a.covariance, atol=1e-12)
     with pytest.raises(CalibrationError, match=r"\[lights\]"):
         read_light_odometry(str(tmp_path / "lights.mcap"), replace(RIG, lights=None))
-    write_odometry(tmp_path / "other.mcap", of_camera, child_frame_id="forklift")
+    write_odometry(tmp_path / "other.mcap", of_camera, body="forklift")
     with pytest.raises(CalibrationError, match="forklift"):
         read_light_odometry(str(tmp_path / "other.mcap"), RIG)
 
@@ -124,7 +125,7 @@ def test_bags_that_cannot_serve(tmp_path):
     write_odometry(tmp_path / "lights.bag", fixes())
     with pytest.raises(SourceError, match=TOPIC):
         read_light_odometry(f"{tmp_path / 'lights.bag'}:/other", RIG)
-    write_odometry(tmp_path / "odom.bag", fixes(), frame_id="odom")
+    write_odometry(tmp_path / "odom.bag", fixes(), world="odom")
     with pytest.raises(SourceError, match="'odom'"):
         read_light_odometry(str(tmp_path / "odom.bag"), RIG)
 

@@ -1,5 +1,7 @@
 """Positions from lights: exact without noise, consistent with it, and silent where they would be wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.lights.conic import disc_poses, image_of_disc
 from lodelight.lights.level import Leveller
 from lodelight.lights.odometry import LightOdometry
+from lodelight.lights.sighted import assigned
 from lodelight.lights.two_lights import poses_from_two_lights
 from lodelight.messages import Imu
 
@@ -131,6 +134,26 @@ def test_two_places_that_look_the_same_abstain():
     fix = LightOdometry(SPEC, here + again).locate(sightings(truth, here, rng, names=names), truth.R[2])
     assert fix.T_world_body is None
     assert "more than one place" in fix.why
+
+
+def test_a_code_used_once_names_its_light_and_one_used_again_only_the_nearest():
+    lights = {k.id: k for k in ceiling([(0.0, 0.0), (5.0, 0.0), (14.0, 0.0)])}
+    T = SE3.identity() @ SPEC.T_body_cam
+    for x, names, expected in (
+        (0.9, ("L1",), "L1"),  # 4.1 m from its survey
+        (0.9, ("L0", "L2"), "L0"),
+        (0.9, ("L0", "L1"), "L0"),
+        (-2.4, ("L0", "L1"), "L0"),
+        (1.9, ("L0", "L1"), None),  # 1.9 and 3.1 m
+    ):
+        (seen,) = sightings(
+            SE3.identity(),
+            [replace(lights["L0"], xyz=np.array([x, 0.0, 2.2]))],
+            np.random.default_rng(0),
+            names=[names],
+        )
+        found = assigned(seen, T, SPEC.camera, lights)
+        assert (found and found.id) == expected
 
 
 def test_up_follows_a_turning_body():

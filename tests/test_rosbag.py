@@ -17,8 +17,8 @@ from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.io import open_source
 from lodelight.io.convert import convert
+from lodelight.io.covariances import covariance_from_ros, covariance_to_ros
 from lodelight.io.euroc_writer import append_image, write_sensors
-from lodelight.io.odometry_bag import covariance_from_ros, covariance_to_ros
 from lodelight.io.rig_toml import format_rig, write_rig
 from lodelight.io.rosbag import Bag
 from lodelight.io.rosbag_images import BAYER, grey

@@ -1,4 +1,10 @@
-"""`covariance.csv`: how sure each pose of a trajectory is."""
+"""How sure each pose of a trajectory is: `covariance.csv`, and the order in which ROS has it.
+
+ROS orders a covariance x, y, z, rx, ry, rz, all along the fixed axes of the header's frame; ours is rotation first, and
+the rotation along the body's axes (the chart of SE3.perturbed):
+
+    Exp(dphi) R = R Exp(dtheta)  =>  dphi = R dtheta,   ros = A ours A^T,  A = [[0, I], [R, 0]]
+"""
 
 from __future__ import annotations
 
@@ -37,3 +43,19 @@ def read_covariances(path: Path) -> tuple[NDArray[np.int64], Array]:
     out[:, UPPER[0], UPPER[1]] = table.values[:, : len(NAMES)]
     out[:, UPPER[1], UPPER[0]] = table.values[:, : len(NAMES)]
     return table.t_ns, out
+
+
+def covariance_to_ros(R: Array, ours: Array) -> Array:
+    """(6, 6) x, y, z, rx, ry, rz along fixed axes, of one in the chart of SE3.perturbed at rotation R."""
+    A = np.zeros((6, 6))
+    A[:3, 3:], A[3:, :3] = np.eye(3), R
+    out: Array = A @ ours @ A.T
+    return out
+
+
+def covariance_from_ros(R: Array, ros: Array) -> Array:
+    """The inverse of `covariance_to_ros`."""
+    A = np.zeros((6, 6))
+    A[:3, 3:], A[3:, :3] = R.T, np.eye(3)
+    out: Array = A @ ros @ A.T
+    return out

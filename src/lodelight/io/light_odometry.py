@@ -10,8 +10,9 @@ import numpy as np
 
 from lodelight.errors import CalibrationError, SourceError
 from lodelight.geometry.se3 import SE3, carried_covariance
-from lodelight.io.covariances import read_covariances
-from lodelight.io.odometry_bag import SUFFIXES, covariance_from_ros, read_odometry_bag
+from lodelight.io.covariances import covariance_from_ros, read_covariances
+from lodelight.io.odometry_bag import read_odometry_bag
+from lodelight.io.rosbag_writer import SUFFIXES
 from lodelight.io.stamps import NS_PER_S, ns_from_seconds, ns_from_text, seconds_text
 from lodelight.io.text import fields, lines
 from lodelight.messages import LightFix

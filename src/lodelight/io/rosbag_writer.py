@@ -21,7 +21,7 @@ import numpy as np
 from lodelight.errors import SourceError
 from lodelight.geometry.cameras import EQUIDISTANT, RADTAN, Camera
 from lodelight.geometry.se3 import SE3
-from lodelight.io.odometry_bag import covariance_to_ros
+from lodelight.io.covariances import covariance_to_ros
 from lodelight.io.stamps import NS_PER_S, seconds_text
 from lodelight.types import AnyArray, Array, Bytes
 
@@ -29,17 +29,21 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 WORLD, BODY = "map", "body"
 LATEST_S = 1 << 31  # ROS 2 counts seconds in 32 bits with a sign
 TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"  # which the types of ROS 1 above lack
+UNKNOWN_TWIST = 1e6 * np.eye(6).ravel()  # (1 km/s)^2; a filter takes zeros for certainty
 FLOAT32 = 7  # of sensor_msgs/PointField
 
 
 class BagWriter:
-    """A new bag; a context. Raises SourceError where the file exists already or cannot be written."""
+    """A new bag; a context. Raises SourceError where the file exists already or cannot be written.
 
-    def __init__(self, path: Path) -> None:
+    replace : a file that exists is replaced, once the new one is whole
+    """
+
+    def __init__(self, path: Path, replace: bool = False) -> None:
         self._dest = Path(path)
         if self._dest.suffix not in SUFFIXES:
             raise SourceError(f"{path}: the name of a bag ends in {', '.join(SUFFIXES)}")
-        if self._dest.exists():
+        if self._dest.exists() and not replace:
             raise SourceError(f"{path} exists already; remove it or choose another name")
         self.ros1 = self._dest.suffix == ".bag"
 
@@ -174,7 +178,10 @@ class BagWriter:
     def odometry(
         self, t_ns: int, T_world_body: SE3, covariance: Array | None = None, world: str = WORLD, body: str = BODY
     ) -> Any:
-        """covariance : (6, 6) in the chart of SE3.perturbed; the message has it in ROS's order and axes."""
+        """covariance : (6, 6) in the chart of SE3.perturbed; the message has it in ROS's order and axes.
+
+        No velocity: zeros of so large a covariance that a filter which reads them anyway learns nothing.
+        """
         pose = self.make("geometry_msgs/PoseWithCovariance", pose=self.pose(T_world_body), covariance=np.zeros(36))
         if covariance is not None:
             pose.covariance = covariance_to_ros(T_world_body.R, covariance).ravel()
@@ -184,7 +191,7 @@ class BagWriter:
             header=self.header(t_ns, world),
             child_frame_id=body,
             pose=pose,
-            twist=self.make("geometry_msgs/TwistWithCovariance", twist=zero, covariance=np.zeros(36)),
+            twist=self.make("geometry_msgs/TwistWithCovariance", twist=zero, covariance=UNKNOWN_TWIST),
         )
 
     def pose(self, T: SE3) -> Any:

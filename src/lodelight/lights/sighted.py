@@ -13,24 +13,23 @@ from lodelight.lights.conic import conic_centre, image_of_disc
 from lodelight.messages import LightSighting
 from lodelight.types import Array
 
-NEAR_M = 2.0  # a light may hang that far from its survey, and still be taken for itself
 CLEARLY = 2.0  # by which the second nearest light of a code must be farther off than the nearest
 
 
 def assigned(sighting: LightSighting, T_world_cam: SE3, camera: Camera, lights: Mapping[str, Light]) -> Light | None:
-    """Of the lights with its code, the one that is expected nearest to it; None where none or several are near."""
+    """Of the lights with its code, the one surveyed nearest to the ray; None where another one is nearly as near.
+
+    A code that is used once names its light wherever that hangs; one that is used again a distance D away, a light that
+    hangs, or a camera that is, up to about D / 3 from where it should be.
+    """
     rays, _ = camera.unproject(np.asarray(sighting.centre_px)[None])
     ray = rays[0] / np.linalg.norm(rays[0])
     found: list[tuple[float, Light]] = []
-    for name in sighting.candidates:
-        light = lights.get(name)
-        if light is None:
-            continue
+    for light in (lights[name] for name in sighting.candidates if name in lights):
         X = T_world_cam.R.T @ (light.xyz - T_world_cam.t)
-        if X[2] > 0.05:
-            found.append((float(np.linalg.norm(X - (X @ ray) * ray)), light))
+        found.append((float(np.linalg.norm(X - max(X @ ray, 0.0) * ray)), light))
     found.sort(key=lambda f: f[0])
-    if not found or found[0][0] > NEAR_M or (len(found) > 1 and found[1][0] < CLEARLY * found[0][0]):
+    if not found or (len(found) > 1 and found[1][0] < CLEARLY * found[0][0]):
         return None
     return found[0][1]
 
