@@ -1,8 +1,9 @@
 """What lights are worth to SLAM: `python benchmarks/gate.py RECORDINGS [--modes none,centre,chi2,patent,tight]`.
 
-RECORDINGS are folders made by `lodelight sim` (any size; `--render FOLDER` makes those of the table). The fixes are
-simulated along the truth, by the receiver's own noise as benchmarks/lights.py measured it: rendering the light camera
-would cost ten times as much. `--moved` surveys the light that is seen most 1 m off, `--swapped` swaps the two.
+RECORDINGS are folders made by `lodelight sim` (any size; `--render FOLDER` makes those of the table). Where one has a
+light camera, its images are read; else, and with `--simulated`, fixes are simulated along the truth, by the receiver's
+own noise as benchmarks/lights.py measured it: rendering that camera costs more than all the rest. `--moved` surveys the
+light that is seen most 1 m off, `--swapped` swaps the two.
 """
 
 from __future__ import annotations
@@ -23,18 +24,20 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from light_scenes import along
-from lodelight.anchors import Anchors
+from lodelight.anchors import Anchors, Light
+from lodelight.cli.lights import light_frames
 from lodelight.evaluation.associate import matched
 from lodelight.evaluation.ate import ate
 from lodelight.io.anchors_toml import read_anchors
-from lodelight.io.rig_toml import write_rig
 from lodelight.io.sources import open_source
+from lodelight.rig import Rig
 from lodelight.settings import with_settings
 from lodelight.sim import rigs
 from lodelight.sim.scenarios import simulate
 from lodelight.slam import Slam, SlamConfig
 
-SIZE, RATE_HZ, DURATION_S = (376, 240), 15.0, 40.0
+SIZE, RATE_HZ, DURATION_S = (376, 240), 15.0, 20.0
+WITH_LIGHT_CAMERA = (1,)  # seeds
 MODES = {
     "none": [],
     "centre": ["gate.use=lights"],
@@ -48,14 +51,14 @@ MODES = {
 def render(folder: Path, seeds: int) -> list[Path]:
     """Moving boxes, three blurred seconds; one camera with depth, since nothing else is needed here."""
     folder.mkdir(parents=True, exist_ok=True)
-    rig = folder / "rig.toml"
-    write_rig(rig, rigs.standard(SIZE, RATE_HZ, lights=False).with_cameras(1))
     made = []
     for building in ("office", "carpark"):
         for seed in range(seeds):
             out = folder / f"gate_{building}_s{seed}"
-            faults = ("people=6", "blur=15:3")
-            simulate(building, out, seed=seed, duration_s=DURATION_S, rig=str(rig), faults=faults)
+            simulate(
+                building, out, seed=seed, duration_s=DURATION_S, size=SIZE, rate_hz=RATE_HZ, cameras=1,
+                lights=seed in WITH_LIGHT_CAMERA, faults=("people=6", "blur=12:3"),
+            )  # fmt: skip
             made.append(out)
     return made
 
@@ -72,16 +75,25 @@ def surveyed(lights, fixes, fault):
     return tuple(replace(k, xyz=by_id[partner[k.id]].xyz) if k.id in partner else k for k in lights), often
 
 
-def run(source: Path, mode: str, settings: list[str], end_s: float, fault: str) -> None:
+def fixes_of(source: Path, rig: Rig, lights: tuple[Light, ...], true: tuple[Light, ...], simulated: bool):
+    """By the rendered light camera, or along the truth, of lights that hang where `true` says."""
+    recording = open_source(source)
+    if not simulated:
+        return [read.fix for read in light_frames(recording, Anchors(lights=lights))]
+    known = lights if lights is not true else None
+    return along(recording.ground_truth(), true, rig.lights, np.random.default_rng(0), known=known)
+
+
+def run(source: Path, mode: str, settings: list[str], end_s: float, fault: str, simulated: bool) -> None:
     recording = open_source(source)
     truth = recording.ground_truth()
-    spec = rigs.standard().lights
-    rig = replace(recording.rig, lights=spec)
-    lights, told = read_anchors(source / "anchors.toml").lights, []
-    fixes = along(truth, lights, spec, np.random.default_rng(0)) if mode != "none" else []
+    simulated = simulated or recording.rig.lights is None
+    rig = replace(recording.rig, lights=recording.rig.lights or rigs.standard().lights)
+    true, told = read_anchors(source / "anchors.toml").lights, []
+    lights, fixes = true, fixes_of(source, rig, true, true, simulated) if mode != "none" else []
     if fault and fixes:
-        known, told = surveyed(lights, fixes, fault)
-        fixes, lights = along(truth, lights, spec, np.random.default_rng(0), known=known), known
+        lights, told = surveyed(true, fixes, fault)
+        fixes = fixes_of(source, rig, lights, true, simulated)
     config = with_settings(SlamConfig(sensors="rgbd"), [*MODES[mode], *settings])
     events = []
     slam = Slam(rig, config, anchors=Anchors(lights=lights), on_event=lambda t, kind, **f: events.append((t, kind, f)))
@@ -92,8 +104,9 @@ def run(source: Path, mode: str, settings: list[str], end_s: float, fault: str) 
     pairs = matched(final, truth)
     stats = slam.stats()
     named = sorted({f["light"] for _, kind, f in events if kind == "light_misplaced"})
+    what = " ".join(filter(None, [source.name, mode, fault, "" if simulated or mode == "none" else "rendered"]))
     print(
-        f"{source.name} {mode}{' ' + fault if fault else ''}: ATE se3 {ate(*pairs, 'se3').rmse_m:.4f}, "
+        f"{what}: ATE se3 {ate(*pairs, 'se3').rmse_m:.4f}, "
         f"none {ate(*pairs, 'none').rmse_m:.4f} m; {stats['keyframes']} keyframes, {statuses['lost']} lost, "
         f"{statuses['relocalized']} relocalized, {stats['loops']} loops, gate {stats.get('gate')}"
         + (f", told {told}, named {named}" if fault else "")
@@ -113,10 +126,12 @@ if __name__ == "__main__":
     parser.add_argument("--modes", default="none,centre")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--end", type=float, default=float("inf"))
+    parser.add_argument("--simulated", action="store_true")
     parser.add_argument("--moved", action="store_true")
     parser.add_argument("--swapped", action="store_true")
     asked = parser.parse_args()
     sources = asked.recordings + (render(asked.render, asked.seeds) if asked.render else [])
     for source in sources:
         for mode in asked.modes.split(","):
-            run(source, mode, asked.set, asked.end, "moved" if asked.moved else "swapped" if asked.swapped else "")
+            fault = "moved" if asked.moved else "swapped" if asked.swapped else ""
+            run(source, mode, asked.set, asked.end, fault, asked.simulated)
