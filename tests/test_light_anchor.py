@@ -103,7 +103,7 @@ def test_the_gate_passes_what_is_right_and_refuses_what_is_not():
 
 def test_a_keyframe_that_passed_is_tied_by_a_prior_about_the_lights_pose():
     loop = Loop().run(6.0)
-    t_ns = loop.anchor._nodes[-1].t_ns
+    t_ns = loop.anchor._path._nodes[-1].t_ns
     T = loop.map.pose(0) @ loop.truth.pose(0).inverse() @ pose_at(loop.truth, t_ns)
     keyframe = loop.map.add_keyframe(t_ns, T, NOTHING, parent=0)
     assert loop.anchor.ask(candidate(t_ns, T)).verdict == "PASS"
@@ -118,7 +118,7 @@ def test_a_keyframe_that_passed_is_tied_by_a_prior_about_the_lights_pose():
 
 def test_tight_lights_are_sightings_of_a_keyframe_at_the_time_of_their_rows():
     loop = Loop(GateConfig(), LightsConfig("tight")).run(6.0)
-    t_ns = loop.anchor._nodes[-1].t_ns
+    t_ns = loop.anchor._path._nodes[-1].t_ns
     T = loop.map.pose(0) @ loop.truth.pose(0).inverse() @ pose_at(loop.truth, t_ns)
     keyframe = loop.map.add_keyframe(t_ns, T, NOTHING, parent=0)
     loop.anchor.inserted(keyframe, t_ns)
@@ -156,3 +156,31 @@ def test_poses_that_fit_no_alignment_abstain_and_say_so():
     assert not loop.anchor.aligned
     assert "PASS" not in {v.verdict for v in said}
     assert any("agree" in v.why for v in said if v.verdict == "ABSTAIN")
+
+
+def test_lights_of_another_clock_are_named_and_hold_nothing_until_it_is_set():
+    late_s, said = 0.06, []
+    ask = lambda t_ns: said.append(loop.anchor.ask(candidate(t_ns, SE3.identity())))  # noqa: E731
+    for config in (LightsConfig(), LightsConfig(late_s=late_s)):
+        loop = Loop(lights=config)
+        loop.fixes = [replace(f, t_ns=f.t_ns + round(late_s * 1e9), seen=()) for f in loop.fixes]
+        said.clear()
+        loop.run(each=lambda t_ns: ask(t_ns) if t_ns > 12_000_000_000 else None)
+        whys = {v.why for v in said}
+        if config.late_s:
+            assert loop.of("light_clock") == []
+            assert not any("clock" in why for why in whys)
+        else:
+            (event,) = loop.of("light_clock")
+            assert event["late_s"] == pytest.approx(late_s, abs=0.02)
+            assert {v.verdict for v in said} == {"ABSTAIN"}
+            assert all("of another clock" in why for why in whys)
+
+
+def test_one_light_at_a_time_abstains_and_says_so():
+    loop = Loop(known=LIGHTS)
+    loop.fixes = along(loop.truth, LIGHTS[::6], SPEC, np.random.default_rng(0), known=LIGHTS[::6])
+    said = []
+    loop.run(each=lambda t_ns: said.append(loop.anchor.ask(candidate(t_ns, SE3.identity()))))
+    assert {v.verdict for v in said} == {"ABSTAIN"}
+    assert any("one light only: its yaw is unknown" in v.why for v in said)

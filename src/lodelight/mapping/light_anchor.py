@@ -7,28 +7,28 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3
-from lodelight.lights.alignment import Pair, agreement, align
 from lodelight.lights.buffer import REACH_S, FixBuffer, LightPose
+from lodelight.lights.clock import ClockCheck
 from lodelight.lights.sighted import assigned, centre_px
 from lodelight.lights.watch import LightWatch
 from lodelight.mapping.anchoring import Anchoring, AnchorSighting
+from lodelight.mapping.body_path import BodyPath, Node
 from lodelight.mapping.keyframes import Candidate, Verdict
 from lodelight.mapping.light_gate import GateConfig, LightGate, difference
+from lodelight.mapping.light_placement import Move, Placement
 from lodelight.mapping.map import Map
 from lodelight.messages import LightFix, LightSighting
 from lodelight.types import Array
 
 NS = 1e-9
-NODES = 64  # frames that are remembered, to know where the body was when a light was seen
-NODE_GAP_S = 0.25
-PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
-ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
+RECENT = 64  # sightings that a keyframe to come may have, and fixes that wait for the frame behind them
+CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
 NOT_YET = "the map's place in the world rests on less than ten fixes"
@@ -39,12 +39,14 @@ class LightsConfig:
     """use : off, or tight: sightings of lights are part of every adjustment
     sigma_px : of a light's centre; near_s : between a keyframe and a sighting that becomes part of it
     drift : error of the tracked motion between the two, as a share of its length
+    late_s : by which the lights' stamps are behind the images', of gated lights as well
     """
 
     use: str = "off"
     sigma_px: float = 0.5
     near_s: float = 0.12
     drift: float = 0.02
+    late_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.use not in ("off", "tight"):
@@ -52,28 +54,11 @@ class LightsConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class _Node:
-    """Where the body was, held to a keyframe, so that it moves with the map."""
-
-    t_ns: int
-    reference: int
-    T_reference_body: SE3
-
-
-@dataclass(frozen=True, eq=False)
-class _Met:
-    """A fix, and where the body was in the map at its time."""
-
-    fix: LightFix
-    node: _Node
-
-
-@dataclass(frozen=True, eq=False)
 class _Seen:
     """A sighting whose light is known, and where the body was in the map at its time."""
 
     light: str
-    node: _Node
+    node: Node
     px: Array
     sigma_px: float
 
@@ -93,43 +78,61 @@ class LightAnchor:
         map.anchoring = Anchoring(self.spec, self._lights)
         self._watch = LightWatch(self._lights)
         self._buffer = FixBuffer()
-        self._waiting: deque[LightFix] = deque(maxlen=NODES)
-        self._nodes: deque[_Node] = deque(maxlen=NODES)
-        self._met: list[_Met] = []
-        self._recent: deque[_Seen] = deque(maxlen=NODES)
+        self._waiting: deque[LightFix] = deque(maxlen=RECENT)
+        self._recent: deque[_Seen] = deque(maxlen=RECENT)
+        self._path = BodyPath(map)
+        self._placement = Placement(self._path)
+        self._clock = ClockCheck()
+        self._fixes = 0
+        self._off_clock = ""
         self._keyframe: tuple[int, int] | None = None  # the last one, and its stamp
         self._why_none = "no light seen yet"
         self._verdict: tuple[int, Verdict, LightPose] | None = None
         self._pending: SE3 | None = None
         self._asked_ns: int | None = None
         self._doubted_ns = -1
-        self._no_fit = ""
-        self.placed = False  # the map has a place in the world, if only by one fix
-        self.aligned = False
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the map has been laid down in the world for good."""
+        return self._placement.aligned
 
     # -- what comes in ------------------------------------------------------------------------------------------
 
     def feed(self, fix: LightFix) -> None:
         """A fix, or the sightings alone of an image that gave none."""
+        late_ns = round(self.config.late_s * 1e9)
+        if late_ns:
+            seen = tuple(replace(sighting, t_ns=sighting.t_ns - late_ns) for sighting in fix.seen)
+            fix = replace(fix, t_ns=fix.t_ns - late_ns, seen=seen)
         bad = [name for name in fix.lights if name in self._watch.misplaced]
         if fix.T_world_body is None:
             self._why_none = fix.why
         elif bad:
             self._why_none = f"light {bad[0]} is not where it was surveyed"
         else:
+            self._why_none = ""
             self._buffer.add(fix)
+            self._clock.fixed(fix.t_ns, fix.T_world_body.R, fix.covariance)
+            self._fixes += 1
+            if self._fixes % CLOCK_EVERY == 0:
+                self._check_clock(fix.t_ns)
         self._waiting.append(fix)
 
     def tracked(self, t_ns: int, reference: int, T_reference_body: SE3) -> None:
         """A frame was localized: what the lights said since the last one now has its place in the map."""
-        self._nodes.append(_Node(t_ns, reference, T_reference_body))
+        here = Node(t_ns, reference, T_reference_body)
+        self._path.add(here)
+        self._clock.tracked(t_ns, self._path.pose(here).R)
         while self._waiting and self._waiting[0].t_ns <= t_ns:
             fix = self._waiting.popleft()
-            node = self._node_at(fix.t_ns)
+            node = self._path.at(fix.t_ns)
             usable = not any(name in self._watch.misplaced for name in fix.lights)
             if node is not None and fix.T_world_body is not None and usable:
-                self._meet(_Met(fix, node))
-            for sighting in fix.seen if self.aligned else ():
+                move = self._placement.meet(fix.T_world_body, node)
+                if move is not None:
+                    self._place(fix.t_ns, move)
+            for sighting in fix.seen if self.aligned and not self._off_clock else ():
                 self._sight(sighting)
 
     def take_move(self) -> SE3 | None:
@@ -141,15 +144,17 @@ class LightAnchor:
 
     def pose_at(self, t_ns: int) -> tuple[LightPose | None, str]:
         """The body by the lights at a frame's stamp, or why not. An older fix is carried on by the tracked motion."""
+        if self._off_clock:
+            return None, self._off_clock
         if not self.aligned:
-            return None, self._no_fit or NOT_YET
+            return None, self._placement.no_fit or _because(NOT_YET, self._why_none)
         here = self._buffer.at(t_ns)
         if here is None:
-            fix, now = self._buffer.before(t_ns, self.gate.config.stale_s), self._node_at(t_ns)
-            then = self._node_at(fix.t_ns) if fix is not None else None
+            fix, now = self._buffer.before(t_ns, self.gate.config.stale_s), self._path.at(t_ns)
+            then = self._path.at(fix.t_ns) if fix is not None else None
             if fix is None or fix.T_world_body is None or then is None or now is None:
-                return None, f"no pose by the lights within {self.gate.config.stale_s:g} s: {self._why_none}"
-            T = fix.T_world_body @ self._pose(then).inverse() @ self._pose(now)
+                return None, _because(f"no pose by the lights within {self.gate.config.stale_s:g} s", self._why_none)
+            T = fix.T_world_body @ self._path.pose(then).inverse() @ self._path.pose(now)
             here = LightPose(t_ns, T, fix.covariance, fix.lights, fix.rms_px)
         if any(name in self._watch.misplaced for name in here.lights):
             return None, "one of its lights is not where it was surveyed"
@@ -161,7 +166,7 @@ class LightAnchor:
         here, fix = self._buffer.at(t_ns), self._buffer.before(t_ns, REACH_S)
         T = here.T_world_body if here is not None else fix.T_world_body if fix is not None else None
         if T is not None:
-            self.placed = True
+            self._placement.placed = True
             self.emit(t_ns, "world", why="the map begins where the lights say", pairs=1, moved_m=0.0, turned_deg=0.0)
             return T, ""
         waited_s = (t_ns - self._asked_ns) * NS
@@ -169,7 +174,7 @@ class LightAnchor:
 
     def doubt(self, t_ns: int, T_world_body: SE3 | None) -> SE3 | None:
         """Where to look for a frame that was lost, or tracked farther from the lights' pose than the gate allows."""
-        light = self._buffer.at(t_ns) if self.aligned else None
+        light = self._buffer.at(t_ns) if self.aligned and not self._off_clock else None
         config = self.gate.config
         if light is None or t_ns < self.gate.trusted_from_ns or light.rms_px > config.max_rms_px:
             return None
@@ -209,73 +214,33 @@ class LightAnchor:
 
     # -- parts --------------------------------------------------------------------------------------------------
 
-    def _pose(self, node: _Node) -> SE3:
-        return self.map.pose(node.reference) @ node.T_reference_body
-
-    def _node_at(self, t_ns: int) -> _Node | None:
-        """Between two localized frames."""
-        nodes = self._nodes
-        for i in range(len(nodes) - 1, -1, -1):
-            if nodes[i].t_ns == t_ns:
-                return nodes[i]
-            if nodes[i].t_ns < t_ns:
-                if i + 1 == len(nodes) or (nodes[i + 1].t_ns - nodes[i].t_ns) * NS > NODE_GAP_S:
-                    return None
-                a, b = nodes[i], nodes[i + 1]
-                T = self._pose(a).interpolate(self._pose(b), (t_ns - a.t_ns) / (b.t_ns - a.t_ns))
-                return _Node(t_ns, b.reference, self.map.pose(b.reference).inverse() @ T)
-        return None
-
-    def _meet(self, met: _Met) -> None:
-        """Keep a pair, and see whether the map lies where the pairs say."""
-        if self._met and np.linalg.norm(self._pose(met.node).t - self._pose(self._met[-1].node).t) < PAIR_M:
-            return
-        self._met.append(met)
-        if len(self._met) > PAIRS:
-            del self._met[1::2]  # the whole way, half as dense
-        if not self.placed:
-            self._place(
-                self._pairs()[0].T_world_body @ self._pairs()[0].T_map_body.inverse(), "seeded by the first fix", 1
-            )
-        elif not self.aligned or len(self._met) % ALIGN_PAIRS == 0:
-            self._review()
-
-    def _pairs(self) -> list[Pair]:
-        return [Pair(m.fix.T_world_body, self._pose(m.node)) for m in self._met if m.fix.T_world_body is not None]
-
-    def _review(self) -> None:
-        """Align with what most pairs say: once for good, and again only where they contradict what was believed."""
-        pairs = self._pairs()
-        ground_m = float(np.linalg.norm(np.ptp([pair.T_map_body.t for pair in pairs], axis=0)))
-        if len(pairs) < ALIGN_PAIRS or ground_m < ALIGN_M:
-            return
-        now = int(np.count_nonzero(agreement(pairs, SE3.identity())))
-        if self.aligned and now >= 0.5 * len(pairs):
-            return
-        found = align(pairs)
-        if found.count < max(ALIGN_PAIRS, ALIGN_SHARE * len(pairs)) or (self.aligned and found.count < 2 * now):
-            if not self.aligned and len(pairs) >= 2 * ALIGN_PAIRS:
-                self._no_fit = f"only {found.count} of {len(pairs)} poses by the lights agree on a place of the map"
-            return
-        again, self.aligned, self._no_fit = self.aligned, True, ""
-        if again:
+    def _place(self, t_ns: int, move: Move) -> None:
+        if move.again:
             self.map.anchoring = Anchoring(self.spec, self._lights)
-        self._place(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs))
-
-    def _place(self, T_world_map: SE3, why: str, pairs: int) -> None:
-        self.placed = True
-        self._pending = T_world_map
+        self._pending = move.T_world_map
         self._watch.forget()
         self._recent.clear()
-        moved = {"moved_m": float(np.linalg.norm(T_world_map.t)), "turned_deg": math.degrees(T_world_map.angle)}
-        self.emit(self._met[-1].fix.t_ns, "world", why=why, pairs=pairs, **moved)
+        moved = {
+            "moved_m": float(np.linalg.norm(move.T_world_map.t)),
+            "turned_deg": math.degrees(move.T_world_map.angle),
+        }
+        self.emit(t_ns, "world", why=move.why, pairs=move.pairs, **moved)
+
+    def _check_clock(self, t_ns: int) -> None:
+        """Lights of another clock hold nothing any more, from when that shows on."""
+        offset = self._clock.offset()
+        if offset is not None and not self._off_clock:
+            self.emit(t_ns, "light_clock", late_s=offset.late_s, sigma_s=offset.sigma_s, why=offset.why)
+            self.map.anchoring = Anchoring(self.spec, self._lights)
+            self._recent.clear()
+        self._off_clock = offset.why if offset is not None else ""
 
     def _sight(self, sighting: LightSighting) -> None:
         """Name a sighting's light by where the body is, watch whether it hangs there, and tie a keyframe by it."""
-        node = self._node_at(sighting.t_ns)
+        node = self._path.at(sighting.t_ns)
         if node is None or self.spec is None or self._pending is not None:
             return
-        T_world_cam = self._pose(node) @ self.spec.T_body_cam
+        T_world_cam = self._path.pose(node) @ self.spec.T_body_cam
         light = assigned(sighting, T_world_cam, self.spec.camera, self._lights)
         if light is None:
             return
@@ -298,9 +263,13 @@ class LightAnchor:
         apart_s = abs(seen.node.t_ns - t_ns) * NS
         if apart_s > self.config.near_s or not self.map.keyframes.alive[keyframe]:
             return
-        T_keyframe_body = self.map.pose(keyframe).inverse() @ self._pose(seen.node)
-        far_m = float(np.linalg.norm(self._lights[seen.light].xyz - self._pose(seen.node).t))
+        T_keyframe_body = self.map.pose(keyframe).inverse() @ self._path.pose(seen.node)
+        far_m = float(np.linalg.norm(self._lights[seen.light].xyz - self._path.pose(seen.node).t))
         drift_px = self.spec.camera.focal_px * self.config.drift * float(np.linalg.norm(T_keyframe_body.t)) / far_m
         sigma_px = math.hypot(seen.sigma_px, drift_px)
         sighting = AnchorSighting(T_keyframe_body @ self.spec.T_body_cam, seen.px, sigma_px, apart_s)
         self.map.anchoring.add_sighting(keyframe, seen.light, sighting)
+
+
+def _because(what: str, why: str) -> str:
+    return f"{what}: {why}" if why else what

@@ -1,0 +1,64 @@
+"""Where a map lies in the world, as more and more poses by the lights say it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lodelight.geometry.se3 import SE3
+from lodelight.lights.alignment import Pair, agreement, align
+from lodelight.mapping.body_path import BodyPath, Node
+
+PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
+ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """T_world_map by which a map is to be moved, why, and of how many pairs. again : it lay elsewhere, for good."""
+
+    T_world_map: SE3
+    why: str
+    pairs: int
+    again: bool = False
+
+
+class Placement:
+    """Of one map. placed : it has a place in the world, if only by one fix; aligned : for good."""
+
+    def __init__(self, path: BodyPath) -> None:
+        self._path = path
+        self._met: list[tuple[SE3, Node]] = []
+        self.placed = False
+        self.aligned = False
+        self.no_fit = ""  # why the map does not come to lie
+
+    def meet(self, T_world_body: SE3, node: Node) -> Move | None:
+        """A pose by the lights and where the body was in the map at its time; the map may then have to move."""
+        if self._met and np.linalg.norm(self._path.pose(node).t - self._path.pose(self._met[-1][1]).t) < PAIR_M:
+            return None
+        self._met.append((T_world_body, node))
+        if len(self._met) > PAIRS:
+            del self._met[1::2]  # the whole way, half as dense
+        if not self.placed:
+            self.placed = True
+            return Move(T_world_body @ self._path.pose(node).inverse(), "seeded by the first fix", 1)
+        return self._review() if not self.aligned or len(self._met) % ALIGN_PAIRS == 0 else None
+
+    def _review(self) -> Move | None:
+        """Align with what most pairs say: once for good, and again only where they contradict what was believed."""
+        pairs = [Pair(T_world_body, self._path.pose(node)) for T_world_body, node in self._met]
+        ground_m = float(np.linalg.norm(np.ptp([pair.T_map_body.t for pair in pairs], axis=0)))
+        if len(pairs) < ALIGN_PAIRS or ground_m < ALIGN_M:
+            return None
+        now = int(np.count_nonzero(agreement(pairs, SE3.identity())))
+        if self.aligned and now >= 0.5 * len(pairs):
+            return None
+        found = align(pairs)
+        if found.count < max(ALIGN_PAIRS, ALIGN_SHARE * len(pairs)) or (self.aligned and found.count < 2 * now):
+            if not self.aligned and len(pairs) >= 2 * ALIGN_PAIRS:
+                self.no_fit = f"only {found.count} of {len(pairs)} poses by the lights agree on a place of the map"
+            return None
+        again, self.aligned, self.no_fit = self.aligned, True, ""
+        return Move(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs), again)
