@@ -156,12 +156,17 @@ def test_a_code_used_once_names_its_light_and_one_used_again_only_the_nearest():
         assert (found and found.id) == expected
 
 
-def test_up_follows_a_turning_body():
-    leveller = Leveller()
-    R, dt = np.eye(3), 0.005
-    for k in range(2000):
+@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01)])
+def test_up_follows_a_turning_body_and_finds_the_gyros_bias(bias):
+    leveller, rng = Leveller(), np.random.default_rng(9)
+    R, dt, off, said = np.eye(3), 0.005, [], []
+    for k in range(4000):
         gyro = np.array([0.2 * np.cos(0.01 * k), 0.1, 0.3])
-        leveller.feed(Imu(round(k * dt * 1e9), gyro, R.T @ [0.0, 0.0, 9.81]))
+        moved = 1.0 * np.sin([0.06 * k, 0.05 * k, 0.1 * k]) + 0.05 * rng.normal(size=3)  # m/s^2, steps
+        leveller.feed(Imu(round(k * dt * 1e9), gyro + bias, R.T @ (np.array([0.0, 0.0, 9.81]) + moved)))
+        if k >= 2000:
+            off.append(np.arccos(min(1.0, leveller.up_body @ R[2])))
+            said.append(leveller.sigma_rad)
         R = R @ SE3.exp(np.array([*(gyro * dt), 0, 0, 0])).R
-    # the last sample turned the body once more than the filter was told: 0.2 rad/s and 5 ms
-    assert np.degrees(np.arccos(min(1.0, leveller.up_body @ R[2]))) < 0.2
+    assert np.degrees(np.sqrt(np.mean(np.square(off)))) < 1.0
+    assert np.mean(np.square(off)) < 2.0 * 9.0 * np.mean(np.square(said))  # two axes, three sigmas

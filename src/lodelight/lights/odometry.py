@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
@@ -18,7 +19,7 @@ from lodelight.messages import LightFix, LightSighting
 from lodelight.rig import CameraSpec
 from lodelight.types import Array
 
-TILT_DEG = 0.5  # of a level mounting, or of the IMU while it moves
+TILT_DEG = 0.5
 PIXEL_FLOOR = 0.3  # sigma of a centre, with what the lens and the face's unevenness add (science note A3)
 RANGE_RATIO = 1.6  # a light's face may look that much wider or narrower than its radius says
 MEMORY_S = 2.0  # for how long the last fix tells lights of one code apart
@@ -33,7 +34,8 @@ NS = 1e-9
 class LightOdometry:
     """Feed it the sightings of one image after another.
 
-    spec : the light camera; sigma_tilt_deg : of up about either horizontal axis
+    spec : the light camera; sigma_tilt_deg : of a level mounting about either horizontal axis, or of what the IMU's
+    filter does not know: its accelerometer's bias
     """
 
     spec: CameraSpec
@@ -42,12 +44,17 @@ class LightOdometry:
     sigma_floor_px: float = PIXEL_FLOOR
     _last: tuple[int, SE3] | None = field(default=None, init=False)
     _twist: Array | None = field(default=None, init=False)
+    _sigma_tilt_rad: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         self._by_id = {light.id: light for light in self.lights}
 
-    def locate(self, sightings: Sequence[LightSighting], up_body: Array | None = None) -> LightFix:
+    def locate(
+        self, sightings: Sequence[LightSighting], up_body: Array | None = None, sigma_up_rad: float = 0.0
+    ) -> LightFix:
         """Of the body at the mean stamp of the named sightings. up_body : unit; None: the body's z is up.
+
+        sigma_up_rad : of up, beside sigma_tilt_deg
 
         Raises CalibrationError where the lights' map fits only when mirrored.
         """
@@ -57,6 +64,7 @@ class LightOdometry:
             return LightFix(t_ns, None, np.full((6, 6), np.inf), tuple(s.candidates[0] for s in seen if s.id), 0.0,
                             "no light named" if not seen else "one light only: its yaw is unknown")  # fmt: skip
         up_cam = self.spec.T_body_cam.R.T @ (np.array([0.0, 0.0, 1.0]) if up_body is None else up_body)
+        self._sigma_tilt_rad = math.hypot(math.radians(self.sigma_tilt_deg), sigma_up_rad)
         solution, views, why = self._assigned(seen, t_ns, up_cam)
         if solution is None:
             named = [s.id for s in seen if s.id is not None]
@@ -96,7 +104,7 @@ class LightOdometry:
             dt_s = np.array([(s.t_ns - t_ns) * NS for s in seen])
             turn = self.spec.T_body_cam.R.T @ self._twist[:3]
             moved = dt_s[:, None] * np.concatenate([turn, self._twist[3:]])
-        return Views(rays, sigma, lights, moved, up_cam, np.radians(self.sigma_tilt_deg))
+        return Views(rays, sigma, lights, moved, up_cam, self._sigma_tilt_rad)
 
     def _assigned(
         self, seen: Sequence[LightSighting], t_ns: int, up_cam: Array

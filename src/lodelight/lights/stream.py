@@ -24,14 +24,17 @@ class LightFrame:
     times_ms: tuple[float, float] = (0.0, 0.0)
 
 
-def levelled(frames: Iterable[Frame], inertial: Iterator[Imu]) -> Iterator[tuple[Frame, Array | None]]:
-    """Every frame with up in the body frame when it was taken; None where no inertial sample came before it."""
+def levelled(frames: Iterable[Frame], inertial: Iterator[Imu]) -> Iterator[tuple[Frame, Array | None, float]]:
+    """Every frame with up in the body frame when it was taken and its sigma, rad.
+
+    None and 0 where no inertial sample came before it.
+    """
     leveller, waiting = Leveller(), next(inertial, None)
     for frame in frames:
         while waiting is not None and waiting.t_ns <= frame.t_ns:
             leveller.feed(waiting)
             waiting = next(inertial, None)
-        yield frame, leveller.up_body
+        yield frame, leveller.up_body, leveller.sigma_rad if leveller.up_body is not None else 0.0
 
 
 def read_lights(
@@ -41,11 +44,11 @@ def read_lights(
 
     Raises CalibrationError where the map of lights is mirrored.
     """
-    for frame, up_body in levelled(frames, inertial):
+    for frame, up_body, sigma_rad in levelled(frames, inertial):
         began = time.perf_counter()
         sightings = reader.sightings(frame.images[0], frame.t_ns)
         decoded = time.perf_counter()
-        fix = odometry.locate(sightings, up_body)
+        fix = odometry.locate(sightings, up_body, sigma_rad)
         times_ms = (1e3 * (decoded - began), 1e3 * (time.perf_counter() - decoded))
         named = tuple(s for s in sightings if s.candidates)
         fix = replace(fix, t_ns=fix.t_ns or frame.t_ns, seen=named)

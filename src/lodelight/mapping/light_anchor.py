@@ -30,6 +30,7 @@ NS = 1e-9
 RECENT = 64  # sightings that a keyframe to come may have, and fixes that wait for the frame behind them
 CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
+CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
 NOT_YET = "the map's place in the world rests on less than ten fixes"
 
@@ -90,6 +91,7 @@ class LightAnchor:
         self._verdict: tuple[int, Verdict, LightPose] | None = None
         self._pending: SE3 | None = None
         self._asked_ns: int | None = None
+        self._tied_ns: int | None = None  # the last keyframe that a pose by the lights holds
         self._doubted_ns = -1
 
     @property
@@ -183,7 +185,7 @@ class LightAnchor:
         if T_world_body is None:
             return light.T_world_body
         d = difference(T_world_body, np.zeros((6, 6)), light, self.map.rig.cameras[0].T_body_cam)
-        if d.angle_deg <= config.max_deg and d.centre_m <= config.max_m:
+        if (d.angle_deg <= config.max_deg and d.centre_m <= config.max_m) or d.chi2 <= config.chi2:
             return None
         if t_ns != self._doubted_ns:  # not what was found there, when that is shown as well
             self._doubted_ns = t_ns
@@ -207,7 +209,10 @@ class LightAnchor:
             _, verdict, light = self._verdict
             if verdict.verdict == "PASS":
                 floor = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
-                information: Array = verdict.weight * np.asarray(np.linalg.inv(light.covariance + floor), np.float64)
+                since_s = CORRELATED_S if self._tied_ns is None else (t_ns - self._tied_ns) * NS
+                weight = verdict.weight * min(1.0, since_s / CORRELATED_S)
+                information: Array = weight * np.asarray(np.linalg.inv(light.covariance + floor), np.float64)
+                self._tied_ns = t_ns
                 self.map.anchoring.add_pose(keyframe, light.T_world_body, information)
         for seen in self._recent:
             self._tie(seen)

@@ -28,7 +28,7 @@ class GateConfig:
     """use : none, or lights
     mode : centre (distance of camera centres), patent (of the translations of T_cam_world, which a turn of one degree
         changes by 17 cm ten metres from the origin), chi2 (both, by both covariances)
-    max_deg, max_m : differences that still pass; chi2 : likewise, of six degrees of freedom
+    max_deg, max_m : differences that still pass; chi2 : likewise, of six degrees of freedom; below it centre abstains
     stale_s : age of the last fix, carried on by tracking, beyond which the gate abstains; max_rms_px : of the lights
     veto_s : of vetoes without a pass between, before somebody is blamed; distrust_s : what the blamed lights get
     overlap : share of the reference's points in view above which a frame that passed can wait: the lights hold the map
@@ -130,6 +130,8 @@ class LightGate:
         if agrees:
             self._refusing_since_ns = None
             return Verdict("PASS", told, weight, self._can_wait(c))
+        if config.mode == "centre" and d.chi2 <= config.chi2:
+            return self._abstain(f"{told}, which may well be the lights' own error")
         return self._refuse(c, light, told, weight)
 
     def _can_wait(self, c: Candidate) -> str:

@@ -23,9 +23,9 @@ def build(b: Builder) -> None:
     _pillars(b)
     _bays(b)
     for y in (9.0, 21.0):
-        for x in np.arange(4.75, LENGTH - 2.0, 2.5):  # two between two beams
-            for dy in (-1.2, 1.2):
-                b.coded(x, y + dy, 2.75, b.next_frequency(), radius_m=0.12, lumen=1100.0)
+        for x in np.arange(4.125, LENGTH - 2.0, 1.25):  # four pairs between two beams, in view from the lane
+            for dy in (-0.45, 0.45):
+                b.coded(x, y + dy, 2.75, b.next_frequency(), radius_m=0.12, lumen=550.0)
     for x in (3.4, 38.6):
         for y in (12.0, 15.0, 18.0):
             b.coded(x, y, 2.75, b.next_frequency(), radius_m=0.12, lumen=1100.0)
