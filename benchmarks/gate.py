@@ -35,6 +35,7 @@ from lodelight.settings import with_settings
 from lodelight.sim import rigs
 from lodelight.sim.scenarios import simulate
 from lodelight.slam import Slam, SlamConfig
+from lodelight.trajectory import Trajectory
 
 SIZE, RATE_HZ, DURATION_S = (376, 240), 15.0, 20.0
 WITH_LIGHT_CAMERA = (1,)  # seeds
@@ -102,12 +103,16 @@ def run(source: Path, mode: str, settings: list[str], end_s: float, fault: str, 
         statuses[estimate.status] += 1
     final = slam.trajectory()
     pairs = matched(final, truth)
+    alive = slam.map.alive_keyframes
+    held = Trajectory.from_poses(slam.map.keyframes.t_ns[alive].tolist(), [slam.map.pose(int(k)) for k in alive])
     stats = slam.stats()
     named = sorted({f["light"] for _, kind, f in events if kind == "light_misplaced"})
+    of_map = ate(*matched(held, truth), "se3").rmse_m
     what = " ".join(filter(None, [source.name, mode, fault, "" if simulated or mode == "none" else "rendered"]))
     print(
         f"{what}: ATE se3 {ate(*pairs, 'se3').rmse_m:.4f}, "
-        f"none {ate(*pairs, 'none').rmse_m:.4f} m; {stats['keyframes']} keyframes, {statuses['lost']} lost, "
+        f"none {ate(*pairs, 'none').rmse_m:.4f} m, keyframes' se3 {of_map:.4f}; "
+        f"{stats['keyframes']} keyframes, {statuses['lost']} lost, "
         f"{statuses['relocalized']} relocalized, {stats['loops']} loops, gate {stats.get('gate')}"
         + (f", told {told}, named {named}" if fault else "")
         + f", CPU {time.process_time() - began:.0f} s",

@@ -122,6 +122,15 @@ class TagSighting:
         return float(np.linalg.norm(np.roll(self.corners_px, -1, axis=0) - self.corners_px, axis=1).min())
 
 
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """Where an anchor of the building says a frame was taken. sure : it is believed even if nothing is found there."""
+
+    T_world_body: SE3
+    covariance: Array
+    sure: bool
+
+
 Message: TypeAlias = Imu | Frame | LightFix
 
 

@@ -11,10 +11,12 @@ from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3
 from lodelight.types import Array
 
-OFF_M = 0.3  # a light farther than this from its survey hangs elsewhere
+OFF_M = (
+    0.3  # a light farther than this from its survey, across its rays, hangs elsewhere: along them a map's scale tells
+)
 NEAR_M = 0.15  # one nearer than this is where it should be
 WITNESSES, RECENT_S = 2, 3.0  # other lights, seen lately, that must be in their places: else it is the map that is not
-COMPANY = 0.5  # of a light's error: another one that is off by the same, to within that share of it, blames the map
+COMPANY = 0.5  # of a light's error: one seen beside it that is off by the same, to within that share, blames the map
 RAYS, KEPT = 6, 40  # rays that a place is found from, and that are remembered
 PARALLAX = 0.01  # least eigenvalue of the mean of I - d d^T: rays that open by about 12 degrees
 SPREAD_M = 0.15  # rms distance of the place from its rays
@@ -44,35 +46,32 @@ class LightWatch:
 
     def __init__(self, lights: dict[str, Light]) -> None:
         self._lights = lights
-        self._rays: dict[str, deque[tuple[Array, Array]]] = {}
-        self._seen_ns: dict[str, int] = {}
+        self._rays: dict[str, deque[tuple[int, Array, Array]]] = {}
         self.misplaced: dict[str, Misplaced] = {}
 
     def forget(self) -> None:
         """The poses so far were in another frame."""
         self._rays.clear()
-        self._seen_ns.clear()
         self.misplaced.clear()
 
     def see(self, t_ns: int, name: str, T_world_cam: SE3, ray_cam: Array) -> Misplaced | None:
         """One sighting; the light, once, when it proves to hang elsewhere."""
         rays = self._rays.setdefault(name, deque(maxlen=KEPT))
         direction = T_world_cam.R @ ray_cam
-        rays.append((T_world_cam.t, direction / np.linalg.norm(direction)))
-        self._seen_ns[name] = t_ns
+        rays.append((t_ns, T_world_cam.t, direction / np.linalg.norm(direction)))
         if name in self.misplaced:
             return None
         xyz = self._place(name)
-        if xyz is None or np.linalg.norm(xyz - self._lights[name].xyz) < OFF_M or not self._convicted(name, xyz):
+        if xyz is None or self._across_m(name, xyz) < OFF_M or not self._convicted(name, xyz):
             return None
         others = [o for o in self._lights.values() if o.id != name and np.linalg.norm(o.xyz - xyz) < OFF_M]
         found = Misplaced(self._lights[name], xyz, others[0].id if others else "")
         self.misplaced[name] = found
         return found
 
-    def _place(self, name: str) -> Array | None:
+    def _place(self, name: str, since_ns: int | None = None) -> Array | None:
         """(3,) where a light's rays meet; None where they are few, nearly parallel, or do not meet."""
-        rays = self._rays[name]
+        rays = [(c, d) for t_ns, c, d in self._rays[name] if since_ns is None or t_ns >= since_ns]
         if len(rays) < RAYS:
             return None
         centres, directions = np.array([c for c, _ in rays]), np.array([d for _, d in rays])
@@ -84,17 +83,28 @@ class LightWatch:
         off = np.einsum("nij,nj->ni", across, xyz - centres)
         return xyz if np.sqrt((off**2).sum(axis=1).mean()) < SPREAD_M else None
 
-    def _convicted(self, name: str, xyz: Array) -> bool:
-        """Whether the light is to blame, and not the map around it, which would move its neighbours as well."""
+    def _across_m(self, name: str, xyz: Array) -> float:
+        """How far a place is from the light's survey, across the mean ray."""
+        mean = np.sum([d for _, _, d in self._rays[name]], axis=0)
         off = xyz - self._lights[name].xyz
-        witnesses = 0
+        return float(np.linalg.norm(off - (off @ mean) / (mean @ mean) * mean))
+
+    def _convicted(self, name: str, xyz: Array) -> bool:
+        """Whether the light is to blame, and not the map, or a moment's bad tracking, which move its neighbours too.
+
+        Others must have been in their places lately; and of those that were seen beside it one at least must be found,
+        and none be off by the same.
+        """
+        off = xyz - self._lights[name].xyz
+        since_ns, now_ns = self._rays[name][0][0], self._rays[name][-1][0]
+        witnesses = beside = 0
         for other in self._rays:
-            lately = (self._seen_ns[name] - self._seen_ns[other]) * 1e-9 < RECENT_S
-            place = self._place(other) if other != name and lately else None
-            if place is None:
+            if other == name or (now_ns - self._rays[other][-1][0]) * 1e-9 > RECENT_S:
                 continue
-            other_off = place - self._lights[other].xyz
-            if np.linalg.norm(other_off - off) < COMPANY * np.linalg.norm(off):
+            survey, place = self._lights[other].xyz, self._place(other)
+            witnesses += place is not None and bool(np.linalg.norm(place - survey) < NEAR_M)
+            place = self._place(other, since_ns)
+            if place is not None and np.linalg.norm(place - survey - off) < COMPANY * np.linalg.norm(off):
                 return False
-            witnesses += bool(np.linalg.norm(other_off) < NEAR_M)
-        return witnesses >= WITNESSES
+            beside += place is not None
+        return witnesses >= WITNESSES and beside > 0

@@ -11,7 +11,7 @@ from lodelight.features.features import Features
 from lodelight.features.matching import FeatureIndex
 from lodelight.geometry.se3 import SE3
 from lodelight.localization.tracker import Tracked, Tracker
-from lodelight.messages import Status
+from lodelight.messages import Doubt, Status
 from lodelight.types import Array, Ints
 
 
@@ -27,7 +27,7 @@ class Found:
 
 Finder = Callable[[Features], "Found | str"]
 # Told a stamp and T_world_body as tracked (None where it was lost): where to look again, None where that will do.
-Elsewhere = Callable[[int, "SE3 | None"], "SE3 | None"]
+Elsewhere = Callable[[int, "SE3 | None"], "Doubt | None"]
 
 
 class LocalizationMachine:
@@ -62,20 +62,29 @@ class LocalizationMachine:
             few = tracked.n_inliers < good
             self.status = "degraded" if few else "tracking"
             self.why = f"{tracked.n_inliers} inliers, fewer than {good}" if few else ""
-            if found:
+            if tracked.n_inliers == 0:
+                self.why = "what is in view moves, says an anchor of the building"
+            elif found:
                 self.status, self.why = "relocalized", "found where an anchor of the building said"
         self.tracker.accept(tracked)
         return tracked
 
     def _second_look(self, t_ns: int, seen: Features, first: Tracked | None, elsewhere: Elsewhere) -> Tracked | None:
-        """What is found where an anchor says, if there is enough of it and the anchor is content; else the first."""
-        near = elsewhere(t_ns, None if first is None or first.why_lost else first.T_world_body)
-        if near is None:
+        """What is found where an anchor says, if there is enough of it and the anchor is content.
+
+        Else a sure anchor's own pose, with nothing that was matched; else the first.
+        """
+        doubt = elsewhere(t_ns, None if first is None or first.why_lost else first.T_world_body)
+        if doubt is None:
             return first
-        second = self.tracker.track_at(t_ns, seen, near)
-        if second.n_inliers < self.tracker.config.good_inliers or elsewhere(t_ns, second.T_world_body) is not None:
+        second = self.tracker.track_at(t_ns, seen, doubt.T_world_body)
+        enough = second.n_inliers >= self.tracker.config.good_inliers
+        if enough and elsewhere(t_ns, second.T_world_body) is None:
+            return second
+        if not doubt.sure:
             return first
-        return second
+        nothing = np.full(len(seen), -1, np.int32)
+        return Tracked(t_ns, second.seen, doubt.T_world_body, doubt.covariance, nothing, second.reference)
 
     def _relocalize(self, t_ns: int, seen: Features, failed: Tracked | None) -> Tracked:
         found = self._find(seen)

@@ -15,6 +15,7 @@ from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3
 from lodelight.lights.buffer import REACH_S, FixBuffer, LightPose
 from lodelight.lights.clock import ClockCheck
+from lodelight.lights.continuity import Continuity
 from lodelight.lights.sighted import assigned, centre_px
 from lodelight.lights.watch import LightWatch
 from lodelight.mapping.anchoring import Anchoring, AnchorSighting
@@ -23,7 +24,7 @@ from lodelight.mapping.keyframes import Candidate, Verdict
 from lodelight.mapping.light_gate import GateConfig, LightGate, difference
 from lodelight.mapping.light_placement import Move, Placement
 from lodelight.mapping.map import Map
-from lodelight.messages import LightFix, LightSighting
+from lodelight.messages import Doubt, LightFix, LightSighting
 from lodelight.types import Array
 
 NS = 1e-9
@@ -31,6 +32,7 @@ RECENT = 64  # sightings that a keyframe to come may have, and fixes that wait f
 CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
 CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
+DOUBTED_S = 0.2
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
 NOT_YET = "the map's place in the world rests on less than ten fixes"
 
@@ -84,6 +86,7 @@ class LightAnchor:
         self._path = BodyPath(map)
         self._placement = Placement(self._path)
         self._clock = ClockCheck()
+        self._continuity = Continuity()
         self._fixes = 0
         self._off_clock = ""
         self._keyframe: tuple[int, int] | None = None  # the last one, and its stamp
@@ -92,7 +95,7 @@ class LightAnchor:
         self._pending: SE3 | None = None
         self._asked_ns: int | None = None
         self._tied_ns: int | None = None  # the last keyframe that a pose by the lights holds
-        self._doubted_ns = -1
+        self._doubted_ns = -(10**18)
 
     @property
     def aligned(self) -> bool:
@@ -115,6 +118,7 @@ class LightAnchor:
         else:
             self._why_none = ""
             self._buffer.add(fix)
+            self._continuity.fixed(fix.t_ns, fix.T_world_body)
             self._clock.fixed(fix.t_ns, fix.T_world_body.R, fix.covariance)
             self._fixes += 1
             if self._fixes % CLOCK_EVERY == 0:
@@ -130,10 +134,8 @@ class LightAnchor:
             fix = self._waiting.popleft()
             node = self._path.at(fix.t_ns)
             usable = not any(name in self._watch.misplaced for name in fix.lights)
-            if node is not None and fix.T_world_body is not None and usable:
-                move = self._placement.meet(fix.T_world_body, node)
-                if move is not None:
-                    self._place(fix.t_ns, move)
+            if node is not None and fix.T_world_body is not None and usable and not self._doubted_at(fix.t_ns):
+                self._meet(fix, fix.T_world_body, node)
             for sighting in fix.seen if self.aligned and not self._off_clock else ():
                 self._sight(sighting)
 
@@ -174,7 +176,7 @@ class LightAnchor:
         waited_s = (t_ns - self._asked_ns) * NS
         return SE3.identity(), "waits for a first pose by the lights" if waited_s < WAIT_S else ""
 
-    def doubt(self, t_ns: int, T_world_body: SE3 | None) -> SE3 | None:
+    def doubt(self, t_ns: int, T_world_body: SE3 | None) -> Doubt | None:
         """Where to look for a frame that was lost, or tracked farther from the lights' pose than the gate allows."""
         light = self._buffer.at(t_ns) if self.aligned and not self._off_clock else None
         config = self.gate.config
@@ -182,15 +184,16 @@ class LightAnchor:
             return None
         if any(name in self._watch.misplaced for name in light.lights):
             return None
+        said = Doubt(light.T_world_body, light.covariance, self._continuity.vouches(t_ns))
         if T_world_body is None:
-            return light.T_world_body
+            return said
         d = difference(T_world_body, np.zeros((6, 6)), light, self.map.rig.cameras[0].T_body_cam)
-        if (d.angle_deg <= config.max_deg and d.centre_m <= config.max_m) or d.chi2 <= config.chi2:
+        if config.near(d) or d.chi2 <= config.chi2:
             return None
         if t_ns != self._doubted_ns:  # not what was found there, when that is shown as well
             self._doubted_ns = t_ns
             self.emit(t_ns, "light_doubt", angle_deg=d.angle_deg, centre_m=d.centre_m)
-        return light.T_world_body
+        return said
 
     def ask(self, candidate: Candidate) -> Verdict:
         """The gate among the keyframe conditions."""
@@ -218,6 +221,20 @@ class LightAnchor:
             self._tie(seen)
 
     # -- parts --------------------------------------------------------------------------------------------------
+
+    def _doubted_at(self, t_ns: int) -> bool:
+        """Whether frames about a time may have their pose from the lights: they cannot say whether these are right."""
+        return abs(t_ns - self._doubted_ns) * NS < DOUBTED_S
+
+    def _meet(self, fix: LightFix, T_world_body: SE3, node: Node) -> None:
+        move = self._placement.meet(T_world_body, node)
+        if move is not None:
+            self._place(fix.t_ns, move)
+        elif self.aligned and self._pending is None:
+            light = LightPose(fix.t_ns, T_world_body, fix.covariance, fix.lights, fix.rms_px)
+            T_body_cam = self.map.rig.cameras[0].T_body_cam
+            if self.gate.config.near(difference(self._path.pose(node), np.zeros((6, 6)), light, T_body_cam)):
+                self._continuity.agreed(fix.t_ns)
 
     def _place(self, t_ns: int, move: Move) -> None:
         if move.again:

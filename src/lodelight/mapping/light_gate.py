@@ -58,6 +58,10 @@ class GateConfig:
         if min(self.max_deg, self.max_m, self.chi2) <= 0.0:
             raise ValueError("the largest differences must be positive")
 
+    def near(self, d: Difference) -> bool:
+        """Whether both differences are small, of the camera's centres in any mode."""
+        return d.angle_deg <= self.max_deg and d.centre_m <= self.max_m
+
 
 @dataclass(frozen=True)
 class Difference:
