@@ -184,3 +184,19 @@ def test_one_light_at_a_time_abstains_and_says_so():
     loop.run(each=lambda t_ns: said.append(loop.anchor.ask(candidate(t_ns, SE3.identity()))))
     assert {v.verdict for v in said} == {"ABSTAIN"}
     assert any("one light only: its yaw is unknown" in v.why for v in said)
+
+
+def test_a_frame_that_is_carried_along_is_sent_where_the_lights_motion_leads():
+    said = []
+
+    def doubt(t_ns):
+        there = pose_at(loop.truth, t_ns)
+        carried = SE3(there.R, there.t + np.array([0.07, 0.0, 0.0]))  # less than the gate's 0.1 m
+        said.append((loop.anchor.doubt(t_ns, there), loop.anchor.doubt(t_ns, carried), there))
+
+    loop = Loop()
+    loop.run(each=lambda t_ns: doubt(t_ns) if loop.anchor.aligned and 5_000_000_000 < t_ns < 9_000_000_000 else None)
+    assert not any(right for right, _, _ in said)
+    doubts = [(wrong, there) for _, wrong, there in said if wrong]
+    assert len(doubts) > 0.2 * len(said)  # where a fix is 50 ms old at most, and none was doubted just before
+    assert all(wrong.sure and np.linalg.norm(wrong.T_world_body.t - there.t) < 0.03 for wrong, there in doubts)

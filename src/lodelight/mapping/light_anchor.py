@@ -21,8 +21,8 @@ from lodelight.lights.watch import LightWatch
 from lodelight.mapping.anchoring import Anchoring, AnchorSighting
 from lodelight.mapping.body_path import BodyPath, Node
 from lodelight.mapping.keyframes import Candidate, Verdict
-from lodelight.mapping.light_gate import GateConfig, LightGate, difference
-from lodelight.mapping.light_placement import Move, Placement
+from lodelight.mapping.light_gate import Difference, GateConfig, LightGate, difference
+from lodelight.mapping.light_placement import CORRELATED_S, Move, Placement
 from lodelight.mapping.map import Map
 from lodelight.messages import Doubt, LightFix, LightSighting
 from lodelight.types import Array
@@ -31,8 +31,8 @@ NS = 1e-9
 RECENT = 64  # sightings that a keyframe to come may have, and fixes that wait for the frame behind them
 CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
-CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
 DOUBTED_S = 0.2
+MOTION_SHARE = 0.5  # of the gate's thresholds: fixes' motion within a second is better known than their place
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
 NOT_YET = "the map's place in the world rests on less than ten fixes"
 
@@ -184,11 +184,17 @@ class LightAnchor:
             return None
         if any(name in self._watch.misplaced for name in light.lights):
             return None
-        said = Doubt(light.T_world_body, light.covariance, self._continuity.vouches(t_ns))
+        expected = self._continuity.expected(t_ns, light.T_world_body)
+        said = Doubt(expected or light.T_world_body, light.covariance, expected is not None)
         if T_world_body is None:
             return said
-        d = difference(T_world_body, np.zeros((6, 6)), light, self.map.rig.cameras[0].T_body_cam)
-        if config.near(d) or d.chi2 <= config.chi2:
+        d = self._difference(t_ns, T_world_body, light)
+        if expected is not None:
+            off = expected.inverse() @ T_world_body
+            content = config.near(math.degrees(off.angle), float(np.linalg.norm(off.t)), MOTION_SHARE)
+        else:
+            content = config.near(d.angle_deg, d.centre_m) or d.chi2 <= config.chi2
+        if content:
             return None
         if t_ns != self._doubted_ns:  # not what was found there, when that is shown as well
             self._doubted_ns = t_ns
@@ -198,7 +204,8 @@ class LightAnchor:
     def ask(self, candidate: Candidate) -> Verdict:
         """The gate among the keyframe conditions."""
         light, why_not = self.pose_at(candidate.t_ns)
-        verdict = self.gate.ask(candidate, light, why_not)
+        laid = self._placement.covariance(candidate.t_ns, candidate.T_world_body)
+        verdict = self.gate.ask(replace(candidate, covariance=candidate.covariance + laid), light, why_not)
         self._verdict = None if light is None else (candidate.t_ns, verdict, light)
         self.emit(candidate.t_ns, "gate", verdict=verdict.verdict, why=verdict.why, weight=verdict.weight)
         if self.gate.blamed:
@@ -227,20 +234,26 @@ class LightAnchor:
         return abs(t_ns - self._doubted_ns) * NS < DOUBTED_S
 
     def _meet(self, fix: LightFix, T_world_body: SE3, node: Node) -> None:
-        move = self._placement.meet(T_world_body, node)
+        move = self._placement.meet(fix, T_world_body, node)
         if move is not None:
             self._place(fix.t_ns, move)
         elif self.aligned and self._pending is None:
             light = LightPose(fix.t_ns, T_world_body, fix.covariance, fix.lights, fix.rms_px)
-            T_body_cam = self.map.rig.cameras[0].T_body_cam
-            if self.gate.config.near(difference(self._path.pose(node), np.zeros((6, 6)), light, T_body_cam)):
-                self._continuity.agreed(fix.t_ns)
+            here = self._path.pose(node)
+            d = self._difference(fix.t_ns, here, light)
+            if self.gate.config.near(d.angle_deg, d.centre_m):
+                self._continuity.agreed(fix.t_ns, T_world_body, here)
+
+    def _difference(self, t_ns: int, T_world_body: SE3, light: LightPose) -> Difference:
+        laid = self._placement.covariance(t_ns, T_world_body)
+        return difference(T_world_body, laid, light, self.map.rig.cameras[0].T_body_cam)
 
     def _place(self, t_ns: int, move: Move) -> None:
         if move.again:
             self.map.anchoring = Anchoring(self.spec, self._lights)
         self._pending = move.T_world_map
         self._watch.forget()
+        self._continuity.forget()
         self._recent.clear()
         moved = {
             "moved_m": float(np.linalg.norm(move.T_world_map.t)),

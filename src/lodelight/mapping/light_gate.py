@@ -58,9 +58,9 @@ class GateConfig:
         if min(self.max_deg, self.max_m, self.chi2) <= 0.0:
             raise ValueError("the largest differences must be positive")
 
-    def near(self, d: Difference) -> bool:
-        """Whether both differences are small, of the camera's centres in any mode."""
-        return d.angle_deg <= self.max_deg and d.centre_m <= self.max_m
+    def near(self, angle_deg: float, centre_m: float, share: float = 1.0) -> bool:
+        """Whether two differences are within a share of what passes, whatever the mode."""
+        return angle_deg <= share * self.max_deg and centre_m <= share * self.max_m
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lodelight.geometry.se3 import SE3
+from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.lights.alignment import Pair, agreement, align
 from lodelight.mapping.body_path import BodyPath, Node
+from lodelight.messages import LightFix
+from lodelight.types import Array
 
 PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
+CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +32,25 @@ class Placement:
 
     def __init__(self, path: BodyPath) -> None:
         self._path = path
-        self._met: list[tuple[SE3, Node]] = []
+        self._met: list[tuple[LightFix, SE3, Node]] = []
+        self._laid: tuple[int, SE3, Array] | None = None  # when, by which pose of the body, and its covariance
         self.placed = False
         self.aligned = False
         self.no_fit = ""  # why the map does not come to lie
 
-    def meet(self, T_world_body: SE3, node: Node) -> Move | None:
+    def covariance(self, t_ns: int, T_world_body: SE3) -> Array:
+        """(6, 6) of a pose of the body, from how well the map was laid down alone; fixes since then improve on it."""
+        if self._laid is None:
+            return np.zeros((6, 6))
+        laid_ns, T_world_laid, covariance = self._laid
+        since_s = max(0.0, (t_ns - laid_ns) * 1e-9)
+        return carried_covariance(T_world_laid, covariance, T_world_body) / (1.0 + since_s / CORRELATED_S)
+
+    def meet(self, fix: LightFix, T_world_body: SE3, node: Node) -> Move | None:
         """A pose by the lights and where the body was in the map at its time; the map may then have to move."""
-        if self._met and np.linalg.norm(self._path.pose(node).t - self._path.pose(self._met[-1][1]).t) < PAIR_M:
+        if self._met and np.linalg.norm(self._path.pose(node).t - self._path.pose(self._met[-1][2]).t) < PAIR_M:
             return None
-        self._met.append((T_world_body, node))
+        self._met.append((fix, T_world_body, node))
         if len(self._met) > PAIRS:
             del self._met[1::2]  # the whole way, half as dense
         if not self.placed:
@@ -48,7 +60,7 @@ class Placement:
 
     def _review(self) -> Move | None:
         """Align with what most pairs say: once for good, and again only where they contradict what was believed."""
-        pairs = [Pair(T_world_body, self._path.pose(node)) for T_world_body, node in self._met]
+        pairs = [Pair(T_world_body, self._path.pose(node)) for _, T_world_body, node in self._met]
         ground_m = float(np.linalg.norm(np.ptp([pair.T_map_body.t for pair in pairs], axis=0)))
         if len(pairs) < ALIGN_PAIRS or ground_m < ALIGN_M:
             return None
@@ -61,4 +73,7 @@ class Placement:
                 self.no_fit = f"only {found.count} of {len(pairs)} poses by the lights agree on a place of the map"
             return None
         again, self.aligned, self.no_fit = self.aligned, True, ""
+        used = [met for met, agrees in zip(self._met, found.agrees, strict=True) if agrees]
+        last, T_world_body, _ = used[-1]
+        self._laid = last.t_ns, T_world_body, np.mean([fix.covariance for fix, _, _ in used], axis=0)
         return Move(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs), again)
