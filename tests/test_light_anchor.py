@@ -11,8 +11,9 @@ from lodelight.anchors import Light
 from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.keyframes import Candidate
-from lodelight.mapping.light_anchor import LightAnchor, LightsConfig
+from lodelight.mapping.light_anchor import LightAnchor
 from lodelight.mapping.light_gate import GateConfig
+from lodelight.mapping.light_ties import LightsConfig
 from lodelight.mapping.map import Map
 from lodelight.sim.rigs import standard
 from lodelight.trajectory import Trajectory

@@ -23,8 +23,9 @@ from lodelight.localization.machine import LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
 from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
-from lodelight.mapping.light_anchor import LightAnchor, LightsConfig
+from lodelight.mapping.light_anchor import LightAnchor
 from lodelight.mapping.light_gate import GateConfig
+from lodelight.mapping.light_ties import LightsConfig
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig, adjust
 from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,54 +16,24 @@ from lodelight.geometry.se3 import SE3
 from lodelight.lights.buffer import REACH_S, FixBuffer, LightPose
 from lodelight.lights.clock import ClockCheck
 from lodelight.lights.continuity import Continuity
-from lodelight.lights.sighted import assigned, centre_px
-from lodelight.lights.watch import LightWatch
-from lodelight.mapping.anchoring import Anchoring, AnchorSighting
+from lodelight.mapping.anchoring import Anchoring
 from lodelight.mapping.body_path import BodyPath, Node
 from lodelight.mapping.keyframes import Candidate, Verdict
 from lodelight.mapping.light_gate import Difference, GateConfig, LightGate, difference
 from lodelight.mapping.light_placement import CORRELATED_S, Move, Placement
+from lodelight.mapping.light_ties import LightsConfig, LightTies
 from lodelight.mapping.map import Map
-from lodelight.messages import Doubt, LightFix, LightSighting
+from lodelight.messages import Doubt, LightFix
 from lodelight.types import Array
 
 NS = 1e-9
-RECENT = 64  # sightings that a keyframe to come may have, and fixes that wait for the frame behind them
+WAITING = 64  # fixes that wait for the frame behind them
 CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
 DOUBTED_S = 0.2
 MOTION_SHARE = 0.5  # of the gate's thresholds: fixes' motion within a second is better known than their place
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
 NOT_YET = "the map's place in the world rests on less than ten fixes"
-
-
-@dataclass(frozen=True)
-class LightsConfig:
-    """use : off, or tight: sightings of lights are part of every adjustment
-    sigma_px : of a light's centre; near_s : between a keyframe and a sighting that becomes part of it
-    drift : error of the tracked motion between the two, as a share of its length
-    late_s : by which the lights' stamps are behind the images', of gated lights as well
-    """
-
-    use: str = "off"
-    sigma_px: float = 0.5
-    near_s: float = 0.12
-    drift: float = 0.02
-    late_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.use not in ("off", "tight"):
-            raise ValueError(f"{self.use!r} is no use of lights; choose off or tight")
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """A sighting whose light is known, and where the body was in the map at its time."""
-
-    light: str
-    node: Node
-    px: Array
-    sigma_px: float
 
 
 class LightAnchor:
@@ -79,17 +49,15 @@ class LightAnchor:
         self.spec = map.rig.lights
         self._lights = {light.id: light for light in surveyed}
         map.anchoring = Anchoring(self.spec, self._lights)
-        self._watch = LightWatch(self._lights)
         self._buffer = FixBuffer()
-        self._waiting: deque[LightFix] = deque(maxlen=RECENT)
-        self._recent: deque[_Seen] = deque(maxlen=RECENT)
+        self._waiting: deque[LightFix] = deque(maxlen=WAITING)
         self._path = BodyPath(map)
         self._placement = Placement(self._path)
+        self._ties = LightTies(map, self._path, lights, self._lights, emit)
         self._clock = ClockCheck()
         self._continuity = Continuity()
         self._fixes = 0
         self._off_clock = ""
-        self._keyframe: tuple[int, int] | None = None  # the last one, and its stamp
         self._why_none = "no light seen yet"
         self._verdict: tuple[int, Verdict, LightPose] | None = None
         self._pending: SE3 | None = None
@@ -110,7 +78,7 @@ class LightAnchor:
         if late_ns:
             seen = tuple(replace(sighting, t_ns=sighting.t_ns - late_ns) for sighting in fix.seen)
             fix = replace(fix, t_ns=fix.t_ns - late_ns, seen=seen)
-        bad = [name for name in fix.lights if name in self._watch.misplaced]
+        bad = [name for name in fix.lights if name in self._ties.watch.misplaced]
         if fix.T_world_body is None:
             self._why_none = fix.why
         elif bad:
@@ -133,11 +101,12 @@ class LightAnchor:
         while self._waiting and self._waiting[0].t_ns <= t_ns:
             fix = self._waiting.popleft()
             node = self._path.at(fix.t_ns)
-            usable = not any(name in self._watch.misplaced for name in fix.lights)
+            usable = not any(name in self._ties.watch.misplaced for name in fix.lights)
             if node is not None and fix.T_world_body is not None and usable and not self._doubted_at(fix.t_ns):
                 self._meet(fix, fix.T_world_body, node)
-            for sighting in fix.seen if self.aligned and not self._off_clock else ():
-                self._sight(sighting)
+            if self.aligned and not self._off_clock and self._pending is None:
+                for sighting in fix.seen:
+                    self._ties.see(sighting)
 
     def take_move(self) -> SE3 | None:
         """T_world_map by which the map is to be moved now, once."""
@@ -160,7 +129,7 @@ class LightAnchor:
                 return None, _because(f"no pose by the lights within {self.gate.config.stale_s:g} s", self._why_none)
             T = fix.T_world_body @ self._path.pose(then).inverse() @ self._path.pose(now)
             here = LightPose(t_ns, T, fix.covariance, fix.lights, fix.rms_px)
-        if any(name in self._watch.misplaced for name in here.lights):
+        if any(name in self._ties.watch.misplaced for name in here.lights):
             return None, "one of its lights is not where it was surveyed"
         return here, ""
 
@@ -182,7 +151,7 @@ class LightAnchor:
         config = self.gate.config
         if light is None or t_ns < self.gate.trusted_from_ns or light.rms_px > config.max_rms_px:
             return None
-        if any(name in self._watch.misplaced for name in light.lights):
+        if any(name in self._ties.watch.misplaced for name in light.lights):
             return None
         expected = self._continuity.expected(t_ns, light.T_world_body)
         said = Doubt(expected or light.T_world_body, light.covariance, expected is not None)
@@ -214,7 +183,6 @@ class LightAnchor:
 
     def inserted(self, keyframe: int, t_ns: int) -> None:
         """A keyframe entered the map: tie it to the world by what the lights say of its time."""
-        self._keyframe = (keyframe, t_ns)
         if self._verdict is not None and self._verdict[0] == t_ns and self.gate.config.anchor:
             _, verdict, light = self._verdict
             if verdict.verdict == "PASS":
@@ -224,8 +192,7 @@ class LightAnchor:
                 information: Array = weight * np.asarray(np.linalg.inv(light.covariance + floor), np.float64)
                 self._tied_ns = t_ns
                 self.map.anchoring.add_pose(keyframe, light.T_world_body, information)
-        for seen in self._recent:
-            self._tie(seen)
+        self._ties.inserted(keyframe, t_ns)
 
     # -- parts --------------------------------------------------------------------------------------------------
 
@@ -252,9 +219,9 @@ class LightAnchor:
         if move.again:
             self.map.anchoring = Anchoring(self.spec, self._lights)
         self._pending = move.T_world_map
-        self._watch.forget()
+        self._ties.watch.forget()
         self._continuity.forget()
-        self._recent.clear()
+        self._ties.forget()
         moved = {
             "moved_m": float(np.linalg.norm(move.T_world_map.t)),
             "turned_deg": math.degrees(move.T_world_map.angle),
@@ -267,43 +234,8 @@ class LightAnchor:
         if offset is not None and not self._off_clock:
             self.emit(t_ns, "light_clock", late_s=offset.late_s, sigma_s=offset.sigma_s, why=offset.why)
             self.map.anchoring = Anchoring(self.spec, self._lights)
-            self._recent.clear()
+            self._ties.forget()
         self._off_clock = offset.why if offset is not None else ""
-
-    def _sight(self, sighting: LightSighting) -> None:
-        """Name a sighting's light by where the body is, watch whether it hangs there, and tie a keyframe by it."""
-        node = self._path.at(sighting.t_ns)
-        if node is None or self.spec is None or self._pending is not None:
-            return
-        T_world_cam = self._path.pose(node) @ self.spec.T_body_cam
-        light = assigned(sighting, T_world_cam, self.spec.camera, self._lights)
-        if light is None:
-            return
-        px = centre_px(sighting.centre_px, T_world_cam, self.spec.camera, light)
-        ray, _ = self.spec.camera.unproject(px[None])
-        misplaced = self._watch.see(sighting.t_ns, light.id, T_world_cam, ray[0])
-        if misplaced is not None:
-            self.emit(sighting.t_ns, "light_misplaced", light=light.id, off_m=misplaced.off_m, why=misplaced.why)
-            self.map.anchoring.forget_light(light.id)
-        if self.config.use == "tight" and light.id not in self._watch.misplaced:
-            seen = _Seen(light.id, node, px, max(sighting.sigma_px, self.config.sigma_px))
-            self._recent.append(seen)
-            self._tie(seen)
-
-    def _tie(self, seen: _Seen) -> None:
-        """Let the last keyframe have a sighting that is near enough in time."""
-        if self._keyframe is None or self.config.use != "tight" or self.spec is None or not self.aligned:
-            return
-        keyframe, t_ns = self._keyframe
-        apart_s = abs(seen.node.t_ns - t_ns) * NS
-        if apart_s > self.config.near_s or not self.map.keyframes.alive[keyframe]:
-            return
-        T_keyframe_body = self.map.pose(keyframe).inverse() @ self._path.pose(seen.node)
-        far_m = float(np.linalg.norm(self._lights[seen.light].xyz - self._path.pose(seen.node).t))
-        drift_px = self.spec.camera.focal_px * self.config.drift * float(np.linalg.norm(T_keyframe_body.t)) / far_m
-        sigma_px = math.hypot(seen.sigma_px, drift_px)
-        sighting = AnchorSighting(T_keyframe_body @ self.spec.T_body_cam, seen.px, sigma_px, apart_s)
-        self.map.anchoring.add_sighting(keyframe, seen.light, sighting)
 
 
 def _because(what: str, why: str) -> str:
