@@ -13,7 +13,7 @@ import numpy as np
 
 from lodelight.errors import CalibrationError
 from lodelight.geometry.se3 import SE3
-from lodelight.io.odometry_bag import covariance_from_ros, covariance_to_ros
+from lodelight.io.covariances import covariance_from_ros, covariance_to_ros
 from lodelight.io.rosbag_images import grey, raw_depth
 from lodelight.io.rosbag_rig import lens_of_info, pair_by_projection
 from lodelight.messages import LightFix
