@@ -39,6 +39,7 @@ class LocalMappingConfig:
     window : keyframes adjusted together; min_shared : points that make a keyframe part of it
     redundant : share of a keyframe's points that others see as well, above which it is culled
     found_ratio : a point found in a smaller share of the frames that should see it is culled
+    iterations : of the adjustment at a keyframe; the next keyframe's goes on where it ended
     """
 
     sigma_px: float = 1.0
@@ -49,7 +50,7 @@ class LocalMappingConfig:
     min_shared: int = 15
     redundant: float = 0.9
     found_ratio: float = 0.25
-    iterations: int = 10
+    iterations: int = 5
 
 
 class LocalMapper:
