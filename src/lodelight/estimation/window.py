@@ -168,7 +168,8 @@ class Window:
 
     def solve(self, iterations: int | None = None) -> Solution:
         """Estimate everything anew; at its end the oldest keyframe leaves if there is one too many."""
-        most = self.config.iterations if iterations is None else iterations
+        usual = self.config.iterations if self.frames[-1].keyframe else self.config.tail_iterations
+        most = usual if iterations is None else iterations
         for before, frame in zip(self.frames, self.frames[1:], strict=False):
             frame.follow(before.x)
         newest = self.frames[-1]
@@ -185,7 +186,7 @@ class Window:
         n = len(problem.sightings)
         if taken < 0:
             return Solution(False, np.inf, 0, n, 0, np.zeros(0, np.int64))
-        good = self._retested(problem)
+        good = self._retested(problem) if newest.keyframe else True
         rejected = store(self, problem, rows)
         self._problem, self._covariance = problem, None
         seen_now = problem.sightings.frame == len(self.frames) - 1
@@ -205,7 +206,7 @@ class Window:
         return solution
 
     def _retested(self, problem: Problem) -> bool:
-        """Leave out what is no measurement of its point, and settle without it."""
+        """Leave out what is no measurement of its point, and settle without it: what leaves the window is final."""
         bound = self.config.reject_px**2
         good = problem.linear.chi2 <= bound
         if not good.all():

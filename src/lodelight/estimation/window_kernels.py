@@ -63,44 +63,69 @@ def _turned_back(J: Array, at: int, motion: Array, f: int, tau: float) -> None:
 
 @kernel
 def _add_block(
-    J: Array, at: int, width: int, base: int, sign: float, depth: bool, compact: Array, column: Ints, n: int
+    J: Array, at: int, width: int, base: int, sign: float, compact: Array, bases: Ints, widths: Ints, n: int
 ) -> int:
-    """Add columns `at` to at + width of J (3, n), times sign, to those of compact that stand for `base` on; returns how
-    many columns compact has now. depth : with the third row, which is held against nothing."""
-    where = n
-    for a in range(0, n):
-        if column[a] == base:
-            where = a
-            break
-    if where == n:
-        n += width
-        for a in range(width):
-            column[where + a] = base + a
-            compact[0, where + a] = compact[1, where + a] = compact[2, where + a] = 0.0
-    for a in range(width):
-        compact[0, where + a] += sign * J[0, at + a]
-        compact[1, where + a] += sign * J[1, at + a]
-        if depth:
-            compact[2, where + a] += J[2, at + a]
+    """Add columns `at` to at + width of J (3, n), times sign, to the block of compact that stands for the unknowns from
+    `base` on; returns how many blocks compact has now. The third row is held against nothing: only a sign of + has it.
+    """
+    k = 0
+    while k < n and bases[k] != base:
+        k += 1
+    if k == n:
+        bases[n], widths[n] = base, width
+        n += 1
+        for row in range(3):
+            for c in range(width):
+                compact[row, 6 * k + c] = 0.0
+    for c in range(width):
+        compact[0, 6 * k + c] += sign * J[0, at + c]
+        compact[1, 6 * k + c] += sign * J[1, at + c]
+        if sign > 0.0:
+            compact[2, 6 * k + c] += J[2, at + c]
     return n
 
 
 @kernel
 def _add_sighting(
-    J: Array, own: bool, sign: float, frame: int, anchor: int, camera: int, camera_anchor: int, pose_at: int,
-    mount_at: int, offset_at: int, compact: Array, column: Ints, n: int,
+    J: Array, sign: float, frame: int, anchor: int, camera: int, camera_anchor: int, pose_at: int, mount_at: int,
+    offset_at: int, compact: Array, bases: Ints, widths: Ints, n: int,
 ) -> int:  # fmt: skip
     """Add one sighting's derivatives to its unknowns; those of the landmark are dealt with elsewhere."""
     if frame != anchor:
-        n = _add_block(J, 0, 6, pose_at + 6 * anchor, sign, own, compact, column, n)
-        n = _add_block(J, 6, 6, pose_at + 6 * frame, sign, own, compact, column, n)
+        n = _add_block(J, 0, 6, pose_at + 6 * anchor, sign, compact, bases, widths, n)
+        n = _add_block(J, 6, 6, pose_at + 6 * frame, sign, compact, bases, widths, n)
         if offset_at >= 0:
-            n = _add_block(J, 27, 1, offset_at, sign, own, compact, column, n)
+            n = _add_block(J, 27, 1, offset_at, sign, compact, bases, widths, n)
     # at the anchor's own pixel neither poses nor mountings have a say
     if mount_at >= 0 and (frame != anchor or camera != camera_anchor):
-        n = _add_block(J, 15, 6, mount_at + 6 * camera_anchor, sign, own, compact, column, n)
-        n = _add_block(J, 21, 6, mount_at + 6 * camera, sign, own, compact, column, n)
+        n = _add_block(J, 15, 6, mount_at + 6 * camera_anchor, sign, compact, bases, widths, n)
+        n = _add_block(J, 21, 6, mount_at + 6 * camera, sign, compact, bases, widths, n)
     return n
+
+
+@kernel
+def _add_products(
+    compact: Array, weighted: Array, bases: Ints, widths: Ints, n: int, rows: int, H: Array
+) -> None:  # fmt: skip
+    """H += compact^T weighted over its blocks, those of the lower half left out."""
+    for x in range(n):
+        for y in range(n):
+            if bases[y] < bases[x]:
+                continue
+            low, high = bases[x], bases[y]
+            for i in range(widths[x]):
+                j0, j1 = weighted[0, 6 * x + i], weighted[1, 6 * x + i]
+                if rows == 3:
+                    j2 = weighted[2, 6 * x + i]
+                    for j in range(widths[y]):
+                        H[low + i, high + j] += (
+                            j0 * compact[0, 6 * y + j] + j1 * compact[1, 6 * y + j] + j2 * compact[2, 6 * y + j]
+                        )
+                elif widths[y] == 6:
+                    for j in range(6):
+                        H[low + i, high + j] += j0 * compact[0, 6 * y + j] + j1 * compact[1, 6 * y + j]
+                else:
+                    H[low + i, high] += j0 * compact[0, 6 * y] + j1 * compact[1, 6 * y]
 
 
 @kernel
@@ -126,8 +151,9 @@ def visual_terms(
     for m in range(len(start) - 1):
         most = max(most, start[m + 1] - start[m])
     r_all, J_all, good = np.zeros((most, 3)), np.zeros((most, 3, 28)), np.zeros(most, np.bool_)
-    r, E, r_own, J_own, J = np.zeros(3), np.empty((2, 3)), np.zeros(3), np.empty((3, 27)), np.zeros((3, 28))
-    compact, column, J_landmark = np.zeros((3, 40)), np.empty(40, np.int32), np.empty((3, 3))
+    r, E, r_own, J_own = np.zeros(3), np.empty((2, 3)), np.zeros(3), np.empty((3, 27))
+    compact, weighted, J_landmark = np.zeros((3, 48)), np.zeros((3, 48)), np.empty((3, 3))
+    bases, widths = np.empty(8, np.int32), np.empty(8, np.int32)
     still = np.zeros((mount.shape[0], 6))
     V_out[:] = 0.0
     g_landmark[:] = 0.0
@@ -205,36 +231,38 @@ def visual_terms(
             if before[o] < math.inf:
                 comparable += value
             for row in range(3):
-                for a in range(28):
-                    J[row, a] = J_all[k, row, a]
                 for a in range(3):
-                    J_landmark[row, a] = J[row, 12 + a]
-            n = _add_sighting(J, True, 1.0, j, anchor, cj, ci, pose_at, mount_at, offset_at, compact, column, 0)
+                    J_landmark[row, a] = J_all[k, row, 12 + a]
+            n = _add_sighting(
+                J_all[k], 1.0, j, anchor, cj, ci, pose_at, mount_at, offset_at, compact, bases, widths, 0
+            )  # fmt: skip
             if before_row[o] >= 0:
                 for row in range(2):
-                    for a in range(28):
-                        J[row, a] = J_all[back, row, a]
                     for a in range(3):
-                        J_landmark[row, a] -= J[row, 12 + a]
+                        J_landmark[row, a] -= J_all[back, row, 12 + a]
                 n = _add_sighting(
-                    J, False, -1.0, frame[o - k + back], anchor, camera[o - k + back], ci, pose_at, mount_at,
-                    offset_at, compact, column, n,
+                    J_all[back], -1.0, frame[o - k + back], anchor, camera[o - k + back], ci, pose_at, mount_at,
+                    offset_at, compact, bases, widths, n,
                 )  # fmt: skip
             for row in range(2):
-                for a in range(n):
+                for a in range(6 * n):
                     compact[row, a] *= scale
                 for a in range(3):
                     J_landmark[row, a] *= scale
-            for a in range(n):
-                j0, j1, j2 = weight * compact[0, a], weight * compact[1, a], weight * compact[2, a]
-                at = column[a]
-                g[at] += j0 * r[0] + j1 * r[1] + j2 * r[2]
-                for b in range(n):
-                    if column[b] >= at:
-                        H[at, column[b]] += j0 * compact[0, b] + j1 * compact[1, b] + j2 * compact[2, b]
-                at -= pose_at
-                for b in range(3):
-                    W[m, b, at] += j0 * J_landmark[0, b] + j1 * J_landmark[1, b] + j2 * J_landmark[2, b]
+            for row in range(rows):
+                for a in range(6 * n):
+                    weighted[row, a] = weight * compact[row, a]
+            _add_products(compact, weighted, bases, widths, n, rows, H)
+            for x_block in range(n):
+                for i in range(widths[x_block]):
+                    a = 6 * x_block + i
+                    at = bases[x_block] + i
+                    j0, j1 = weighted[0, a], weighted[1, a]
+                    j2 = weighted[2, a] if rows == 3 else 0.0
+                    g[at] += j0 * r[0] + j1 * r[1] + j2 * r[2]
+                    at -= pose_at
+                    for b in range(3):
+                        W[m, b, at] += j0 * J_landmark[0, b] + j1 * J_landmark[1, b] + j2 * J_landmark[2, b]
             slot = 0
             for a in range(3):
                 j0, j1, j2 = weight * J_landmark[0, a], weight * J_landmark[1, a], weight * J_landmark[2, a]
