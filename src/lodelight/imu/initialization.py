@@ -27,6 +27,7 @@ from lodelight.rig import ImuSpec
 from lodelight.types import AnyArray, Array
 
 GRAVITY_M_S2 = 9.81
+ALIGNED_VIEWS = 12
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class StartConfig:
     max_tilt_deg: float = 2.0
     max_velocity: float = 0.15
     max_px: float = 0.8
-    sigma_px: float = 2.0
+    sigma_px: float = 1.3
     bias_gyro: float = 0.05
     bias_accel: float = 0.1
 
@@ -86,7 +87,7 @@ class StartView:
 
 @dataclass(frozen=True, eq=False)
 class Started:
-    """States of the body at the images that were kept, in a frame whose z points up and whose origin is the first.
+    """States of the body at images out of those that were kept, the last among them, in a frame whose z points up and whose origin is the first.
 
     how : "at rest" or "in motion"; why : in words, with figures
     sigma_tilt rad, sigma_velocity m/s, sigma_bias_gyro rad/s, sigma_bias_accel m/s^2 : of the first state
@@ -205,7 +206,7 @@ class Starter:
         if lasting < c.min_tracks and len(rows.start) - 1 < 2 * c.min_tracks:
             return f"{lasting} tracks last for {self._span_s:.1f} s, {c.min_tracks} are needed"
         bias = self._gyro_bias()
-        motions = self._motions(bias)
+        motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
         if not self.metric:
             parallax = self._parallax_deg(motions)
             if parallax < c.min_parallax_deg:
@@ -220,11 +221,12 @@ class Starter:
         return missing or self._started(found)
 
     def _rows(self) -> Rows:
-        """Sightings of the tracks that were seen at least four times, or measured in depth, sorted by track."""
-        track = np.concatenate([v.track for v in self.views])
-        frame = np.repeat(np.arange(len(self.views)), [len(v.track) for v in self.views])
+        """Sightings in the chosen images of the tracks that have four of them or more, sorted by track."""
+        views = [self.views[i] for i in self._chosen]
+        track = np.concatenate([v.track for v in views])
+        frame = np.repeat(np.arange(len(views)), [len(v.track) for v in views])
         camera, ray, inv_depth, sigma = (
-            np.concatenate([getattr(v, name) for v in self.views])
+            np.concatenate([getattr(v, name) for v in views])
             for name in ("camera", "ray", "inv_depth", "sigma_inv_depth")
         )
         _, which, count = np.unique(track, return_inverse=True, return_counts=True)
@@ -235,6 +237,12 @@ class Starter:
             frame[order].astype(np.int32), camera[order].astype(np.int32), landmark.astype(np.int32),
             np.ascontiguousarray(ray[order]), inv_depth[order], sigma[order],
         )  # fmt: skip
+
+    @property
+    def _chosen(self) -> list[int]:
+        """Images that the alignment is made of: neighbours tell little that is new, and take their time."""
+        last = len(self.views) - 1
+        return sorted({round(i) for i in np.linspace(0, last, min(ALIGNED_VIEWS, last + 1))})
 
     def _motions(self, bias: Array) -> list[Preintegration]:
         """From the first image to every other."""
@@ -315,7 +323,7 @@ class Starter:
         """Raise SourceError if everything fits with the accelerometer's sign turned."""
         imu = self.imu
         self.imu = [ImuSamples(s.t_ns, s.gyro, -s.accel) for s in imu]
-        motions = self._motions(bias)
+        motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
         self.imu = imu
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray)
         if isinstance(found, Alignment) and found.inliers > 0.8 * found.n and found.behind < 0.2:
@@ -327,8 +335,8 @@ class Starter:
     def _started(self, found: Alignment) -> Started:
         R0 = upright(found.gravity)
         states = [
-            NavState(view.t_ns, SE3(R0 @ R, R0 @ p), R0 @ v, found.bias_gyro, found.bias_accel)
-            for view, R, p, v in zip(self.views, found.R, found.p, found.v, strict=True)
+            NavState(self.views[i].t_ns, SE3(R0 @ R, R0 @ p), R0 @ v, found.bias_gyro, found.bias_accel)
+            for i, R, p, v in zip(self._chosen, found.R, found.p, found.v, strict=True)
         ]
         why = (
             f"in motion: {self._span_s:.2f} s of images, {found.path_m:.2f} m, scale known to {found.sigma_scale:.1%}, "

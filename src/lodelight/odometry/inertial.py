@@ -221,7 +221,8 @@ class InertialOdometry:
 
     def _started(self, start: Started) -> Window | str:
         """The window, begun with the images of the start, and solved; or why that failed."""
-        views = self._views[-len(start.states) :]
+        stamps = {state.t_ns for state in start.states}
+        views = [tracks for tracks in self._views if tracks.t_ns in stamps]
         still = start.how == "at rest"
         if still:
             chosen = np.array([0, len(views) - 1])
