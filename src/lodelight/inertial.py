@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lodelight.compiled import Stopwatch
-from lodelight.estimation.window import Landmarks
+from lodelight.estimation.inertial_bundle import ImuChain
+from lodelight.estimation.window import Landmarks, Window
 from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.klt import Tracks
@@ -25,8 +26,9 @@ from lodelight.localization.tracker import Tracked, Tracker
 from lodelight.mapping.local import LocalMapper
 from lodelight.mapping.map import Map
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu
+from lodelight.odometry.flown import Flown
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
-from lodelight.types import Array, Bools
+from lodelight.types import Array, Bools, Ints
 
 EventSink = Callable[..., None]
 NEAR_TRACK_PX = 1.5  # a corner so near a track is the same point
@@ -70,6 +72,8 @@ class InertialFront:
         self._reference = -1
         self._T_map_reference = SE3.identity()
         self._in_window: dict[int, int] = {}  # keyframes of the map by their stamps
+        self.flown = Flown()
+        self._window: Window | None = None  # that the last frame was in
         mapper.hold_poses = True  # the window has placed them, with the IMU
 
     def feed(self, message: Imu | Frame) -> Located | None:
@@ -95,6 +99,9 @@ class InertialFront:
 
     def _located(self, step: OdometryStep, clock: Stopwatch) -> Located:
         t_ns = step.frame.t_ns
+        if self._window is not None and self.odometry.window is not self._window:
+            self._leave(self._window)
+        self._window = self.odometry.window
         if step.status not in ("tracking", "degraded"):
             return self._nowhere(step, clock)
         inserted = -1
@@ -180,8 +187,25 @@ class InertialFront:
         T_world_map = self.T_world_map
         for gone in window.departed():
             keyframe = self._in_window.pop(gone.t_ns, -1)
+            self.flown.add(keyframe, gone.state, gone.imu, self.odometry.spec)
             if keyframe >= 0 and keyframe != self._reference and self.map.keyframes.alive[keyframe]:
                 self.map.set_pose(keyframe, T_world_map @ gone.state.T_world_body)
+
+    def chain(self, keyframes: Ints, R: Array) -> ImuChain | None:
+        """The IMU between these keyframes of the map (K,), whose rotations are (K, 3, 3); None where there is none."""
+        if self._window is not None:
+            self._leave(self._window)
+            self._window = None
+        return self.flown.chain(keyframes, R)
+
+    def _leave(self, window: Window) -> None:
+        """A window that ends: its keyframes have flown."""
+        for gone in window.departed():
+            self.flown.add(self._in_window.pop(gone.t_ns, -1), gone.state, gone.imu, self.odometry.spec)
+        frames = [frame for frame in window.frames if frame.keyframe]
+        for frame, after in zip(frames, [*frames[1:], None], strict=True):
+            imu = after.imu.samples if after is not None and after.imu is not None else None
+            self.flown.add(self._in_window.pop(frame.t_ns, -1), frame.state, imu, self.odometry.spec)
 
 
 def level(T: SE3, T_inner: SE3) -> SE3:

@@ -22,6 +22,7 @@ from lodelight.io.recording import Recording, woven
 from lodelight.localization.machine import LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
 from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
+from lodelight.mapping.inertial_adjust import adjust_with_imu
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
 from lodelight.mapping.light_anchor import LightAnchor
 from lodelight.mapping.light_gate import GateConfig
@@ -48,16 +49,12 @@ class SlamConfig:
 
     min_start_points : close points below which no map is begun
     final_iterations : of the adjustment of the whole map at the end of a run
-    inertial_sigma_rad, inertial_sigma_m : how far that adjustment may believe keyframes to be from where the inertial
-        window saw them last; images alone would let the scale of one camera go
     """
 
     sensors: str = "rgbd"
     seed: int = 0
     min_start_points: int = 50
     final_iterations: int = 10
-    inertial_sigma_rad: float = 0.01
-    inertial_sigma_m: float = 0.03
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackerConfig = field(default_factory=TrackerConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -158,11 +155,12 @@ class Slam:
         self.tags.prepare()
         if self.config.final_iterations and len(self.map.keyframes):
             orb, sigma_px = self.config.orb, self.config.mapping.sigma_px
-            believed = (self.config.inertial_sigma_rad, self.config.inertial_sigma_m) if self.inertial else None
-            adjust(
-                self.map, self.map.alive_keyframes, orb, sigma_px, self.config.final_iterations, None,
-                pose_sigma=believed,
-            )  # fmt: skip
+            iterations = self.config.final_iterations
+            with_imu = self.inertial is not None and adjust_with_imu(
+                self.map, orb, sigma_px, iterations, self.inertial.chain, not self.config.sensors.startswith("mono")
+            )
+            if not with_imu:
+                adjust(self.map, self.map.alive_keyframes, orb, sigma_px, iterations, None)
         self.tags.finish()
 
     def feed(self, message: Message) -> Estimate | None:

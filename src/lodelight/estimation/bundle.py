@@ -42,7 +42,7 @@ def bundle_adjust(
     covariance_of : keyframes whose marginal covariance is wanted, with all points uncertain; it counts what the last
         stage counted, or after a robust one the inliers, less what their test costs (see `factors.reprojection`)
     """
-    adjustment = _Adjustment(problem)
+    adjustment = Adjustment(problem)
     adjustment.run(iterations, robust, stop)
     if robust or polish:
         adjustment.drop_outliers()
@@ -52,7 +52,7 @@ def bundle_adjust(
 
 
 @dataclass
-class _Linear:
+class Linear:
     """Normal equations at one state."""
 
     chi2: Array
@@ -62,17 +62,22 @@ class _Linear:
     g_point: Array
     W: Array
     cost: float = 0.0
+    chain_H: Array | None = None
+    chain_g: Array | None = None
 
 
 @dataclass
-class _State:
+class State:
+    """rest (K, 9) : velocity and biases, where there is an IMU"""
+
     R: Array
     p: Array
     xyz: Array
+    rest: Array | None = None
 
 
 @dataclass
-class _Adjustment:
+class Adjustment:
     """The problem sorted for the kernels, and the work in progress."""
 
     problem: BundleProblem
@@ -86,9 +91,11 @@ class _Adjustment:
         node[free] = np.arange(len(free))
         by_point = np.argsort(all_.point, kind="stable")
         self.point_start = np.searchsorted(all_.point[by_point], np.arange(m + 1)).astype(np.int32)
-        self.plan = BlockPlan.of(_couplings(node[all_.keyframe[by_point]], self.point_start, len(free)))
+        self.plan = BlockPlan.of(
+            self._coupled(_couplings(node[all_.keyframe[by_point]], self.point_start, len(free)), node)
+        )
         self.position = np.full(k, -1, np.int32)
-        self.position[free] = self.plan.position
+        self.position[free] = self.plan.position[: len(free)]
         self.order = np.lexsort((self.position[all_.keyframe], all_.point))
         self.fixed_points = all_.fixed_points
         self.lenses = all_.lenses
@@ -98,17 +105,21 @@ class _Adjustment:
         self.px, self.sigma_px, self.inv_depth, self.sigma_inv_depth, self.weight = (
             as_f64(a[self.order]) for a in (all_.px, all_.sigma_px, all_.inv_depth, all_.sigma_inv_depth, all_.weight)
         )
-        self.state, self.trial = (_State(as_f64(q.R).copy(), as_f64(q.p).copy(), all_.xyz.copy()) for _ in range(2))
+        self.state, self.trial = (State(as_f64(q.R).copy(), as_f64(q.p).copy(), all_.xyz.copy()) for _ in range(2))
         self.linear, self.trial_linear = (
-            _Linear(
+            Linear(
                 np.full(n, np.inf), np.empty((k, 6, 6)), np.empty((k, 6)), np.empty((m, 6)), np.empty((m, 3)),
                 np.empty((n, 3, 6)),
             )
             for _ in range(2)
         )  # fmt: skip
         self.V_inverse = np.empty((m, 6))
-        self.S, self.b = np.empty((self.plan.n_blocks, 6, 6)), np.empty((len(free), 6))
+        self.S, self.b = np.empty((self.plan.n_blocks, 6, 6)), np.empty((len(self.plan.position), 6))
         self.active, self.worth = np.ones(n, bool), np.ones(n)
+
+    def _coupled(self, poses: Bools, node: Ints) -> Bools:
+        """Which unknowns couple: those of the poses (n, n), and whatever else there is behind them."""
+        return poses
 
     @property
     def inliers(self) -> Bools:
@@ -148,7 +159,7 @@ class _Adjustment:
         at = self.state
         return BundleResult(at.R, at.p, at.xyz[:m], inliers[:n], chi2[:n], self.cost, covariance, chi2[n:])
 
-    def _linearize(self, at: _State, out: _Linear, robust: bool, before: Array) -> float:
+    def _linearize(self, at: State, out: Linear, robust: bool, before: Array) -> float:
         """Fill `out`; returns its cost as far as it can be compared with the state that had `before`."""
         q = self.problem
         out.cost, comparable = bundle_kernels.linearize(
@@ -175,7 +186,7 @@ class _Adjustment:
             comparable += extra
         return comparable
 
-    def _add_survey(self, at: _State, out: _Linear) -> float:
+    def _add_survey(self, at: State, out: Linear) -> float:
         """Hold the lights, the last of the points, to where they were surveyed; returns the cost."""
         lights = self.problem.lights
         if lights is None:
@@ -188,12 +199,15 @@ class _Adjustment:
         return float((information * (off**2).sum(axis=1)).sum())
 
     def _reduce(self, damping: float) -> bool:
+        self._reduce_points(damping)
+        return self.plan.factor(self.S)
+
+    def _reduce_points(self, damping: float) -> None:
         at = self.linear
         bundle_kernels.reduce(
             damping, self.keyframe, self.point_start, self.fixed_points, self.position, self.plan.slot,
             at.U, at.g_pose, at.V, at.g_point, at.W, self.V_inverse, self.S, self.b,
         )  # fmt: skip
-        return self.plan.factor(self.S)
 
     def _step(self, damping: float) -> float | None:
         """Fill the trial state; returns the gain it promises, None where the damped system is not definite."""

@@ -103,17 +103,22 @@ class WindowFrame:
         """The IMU since the frame before, prepared for the kernels."""
         self.imu = imu
         self.omega = imu.samples.gyro[-1] - imu.bias_gyro
-        self.measured = np.concatenate(
-            [imu.dR.ravel(), imu.dp, imu.dv, imu.jacobian.ravel(), imu.bias_gyro, imu.bias_accel, [imu.dt_s]]
-        )
-        deviation = np.sqrt(np.diag(imu.covariance))  # scaled first: its units run over ten powers of ten
-        factor = np.linalg.cholesky(imu.covariance / np.outer(deviation, deviation))
-        self.whiten = np.tril(np.linalg.inv(factor)) / deviation
+        self.measured, self.whiten = prepared(imu)
 
     def follow(self, x_before: Array) -> None:
         """Integrate anew where the biases have left what was integrated with."""
         if self.imu is not None and self.imu.moved(x_before[15:18], x_before[18:21]):
             self.carry(self.imu.repropagated(x_before[15:18].copy(), x_before[18:21].copy()))
+
+
+def prepared(imu: Preintegration) -> tuple[Array, Array]:
+    """measured (76,) and whiten (15, 15), the inverse of the covariance's factor, as the kernels have them."""
+    measured = np.concatenate(
+        [imu.dR.ravel(), imu.dp, imu.dv, imu.jacobian.ravel(), imu.bias_gyro, imu.bias_accel, [imu.dt_s]]
+    )
+    deviation = np.sqrt(np.diag(imu.covariance))  # scaled first: its units run over ten powers of ten
+    factor = np.linalg.cholesky(imu.covariance / np.outer(deviation, deviation))
+    return measured, np.tril(np.linalg.inv(factor)) / deviation
 
 
 def row_of(state: NavState) -> Array:

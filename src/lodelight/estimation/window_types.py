@@ -17,8 +17,8 @@ class WindowConfig:
     """Settings of the window.
 
     keyframes : that stay; one more frame, the newest, is there besides
-    iterations : at most, per solve of a keyframe; tail_iterations : of another frame, which starts from a settled window
-        and leaves nothing behind
+    iterations : at most, per solve of a keyframe
+    tail_iterations : of another frame, which starts from a settled window and leaves nothing behind
     calibrate : "none", "extrinsics" (where the cameras sit), "time" (offset of their clock) or "both", with the sigmas
         of what the rig says
     reject_px : a residual of so many sigmas is no measurement of its point

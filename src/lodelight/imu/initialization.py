@@ -87,7 +87,8 @@ class StartView:
 
 @dataclass(frozen=True, eq=False)
 class Started:
-    """States of the body at images out of those that were kept, the last among them, in a frame whose z points up and whose origin is the first.
+    """States of the body at images out of those that were kept, the last among them, in a frame whose z points up and
+    whose origin is the first.
 
     how : "at rest" or "in motion"; why : in words, with figures
     sigma_tilt rad, sigma_velocity m/s, sigma_bias_gyro rad/s, sigma_bias_accel m/s^2 : of the first state
