@@ -7,21 +7,25 @@ import dataclasses
 import numpy as np
 import pytest
 
+from lodelight.anchors import tag_corners
 from lodelight.errors import SourceError
 from lodelight.evaluation.compare import Comparison, compare
+from lodelight.geometry.se3 import SE3
 from lodelight.imu.initialization import upright
-from lodelight.messages import Frame, Imu
+from lodelight.messages import Frame, Imu, TagSighting
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
+from lodelight.rig import ImuSpec
 from lodelight.sim.motion import Motion
 from lodelight.trajectory import Trajectory
 from odometry_scenes import START_NS, Points, flight, messages, rig
 
 
 def run(
-    motion: Motion, cameras: int, seed: int = 0, change=None, sigma_px: float = 0.06
-) -> tuple[list[OdometryStep], InertialOdometry, list]:
-    """change : called with every message; returns what is fed instead, None = nothing"""
-    world, events = rig(cameras), []
+    motion: Motion, cameras: int, seed: int = 0, change=None, sigma_px: float = 0.06, spec: ImuSpec | None = None,
+    look=lambda frame: (),
+) -> tuple[list[OdometryStep], InertialOdometry, list]:  # fmt: skip
+    """change : called with every message; returns what is fed instead, None = nothing; look : tags of a frame"""
+    world, events = rig(cameras, spec), []
     odometry = InertialOdometry(
         world, "stereo" if cameras > 1 else "mono", on_event=lambda t, kind, **f: events.append((t, kind, f))
     )
@@ -31,7 +35,8 @@ def run(
         message = change(message) if change else message
         if message is None:
             continue
-        step = odometry.feed_frame(message) if isinstance(message, Frame) else odometry.feed_imu(message)
+        tags = look(message) if isinstance(message, Frame) else ()
+        step = odometry.feed_frame(message, tags) if isinstance(message, Frame) else odometry.feed_imu(message)
         if step is not None:
             steps.append(step)
     return steps, odometry, events
@@ -128,3 +133,53 @@ def test_the_upright_frame_has_gravity_down():
         assert np.allclose(R @ R.T, np.eye(3))
         assert np.linalg.det(R) > 0
         assert np.allclose(R @ down, [0.0, 0.0, -np.linalg.norm(down)])
+
+
+WALL_TAG = SE3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([2.6, 0.1, 1.5]))
+SIZE_M, SIGMA_TAG_PX = 0.3, 0.3
+
+
+def with_tag(steps_motion: Motion, moved_at_s: float = np.inf):
+    """Sightings of one tag on the wall ahead, that hangs half a metre aside from a moment on."""
+    rng, camera = np.random.default_rng(5), rig(1).cameras[0]
+
+    def look(frame: Frame) -> list[TagSighting]:
+        T = steps_motion.at_ns(np.array([frame.t_ns])).poses()[0] @ camera.T_body_cam
+        aside = np.array([0.0, 0.5 * ((frame.t_ns - START_NS) * 1e-9 > moved_at_s), 0.0])
+        px, seen = camera.camera.project(T.inverse() @ (WALL_TAG @ tag_corners(SIZE_M) + aside))
+        if not seen.all():
+            return []
+        px = px + SIGMA_TAG_PX * rng.standard_normal((4, 2))
+        return [TagSighting(frame.t_ns, "tag36h11", "3", px, np.full(4, SIGMA_TAG_PX), size_m=SIZE_M)]
+
+    return look
+
+
+def length_ratio(steps: list[OdometryStep], motion: Motion) -> float:
+    live = [s for s in steps if s.status == "tracking"]
+    ours = np.array([s.state.T_world_body.t for s in live])[::10]
+    true = motion.at_ns(np.array([s.frame.t_ns for s in live])).xyz[::10]
+    lengths = [np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum() for xyz in (ours, true)]
+    return float(lengths[0] / lengths[1])
+
+
+def test_a_tag_of_known_size_is_a_keyframe_at_first_sight_and_keeps_the_scale():
+    """The IMU is ten times as noisy as a good one."""
+    motion = flight(4.0, seed=6)
+    spec = ImuSpec(gyro_noise=1.7e-3, accel_noise=2e-2)
+    steps, odometry, _ = run(motion, 1, spec=spec, look=with_tag(motion))
+    assert any(s.keyframe == "first sight of tag36h11 3" for s in steps)
+    assert odometry.window is not None
+    assert odometry.window.knows("tag36h11 3")
+    assert abs(length_ratio(steps, motion) - 1.0) < 0.01
+
+
+def test_a_tag_that_is_moved_is_named_within_three_frames_and_has_no_say():
+    motion = flight(5.0, seed=6)
+    steps, odometry, events = run(motion, 1, look=with_tag(motion, moved_at_s=3.5))
+    named = [(t, f) for t, kind, f in events if kind == "tag"]
+    assert [f["tag"] for _, f in named] == ["tag36h11 3"]
+    first = next(s.frame.t_ns for s in steps if (s.frame.t_ns - START_NS) * 1e-9 > 3.5 and s.tags)
+    assert named[0][0] - first <= 2 * 50_000_000
+    assert odometry.restarts == 0
+    assert judged(steps, motion).ate.rmse_m < 0.03

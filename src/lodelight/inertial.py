@@ -8,7 +8,7 @@ right.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ from lodelight.localization.machine import Finder
 from lodelight.localization.tracker import Tracked, Tracker
 from lodelight.mapping.local import LocalMapper
 from lodelight.mapping.map import Map
-from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu, TagSighting
 from lodelight.odometry.flown import Flown
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
 from lodelight.types import Array, Bools, Ints
@@ -42,6 +42,7 @@ class Located:
     """One frame: its estimate, and where it hangs: reference is a keyframe of the map, -1 where there is none.
 
     inserted : the keyframe that this frame became, -1 where it did not; why : the reason
+    tags : that were seen in it
     """
 
     frame: Frame
@@ -50,6 +51,7 @@ class Located:
     T_reference_body: SE3
     inserted: int = -1
     why: str = ""
+    tags: tuple[TagSighting, ...] = ()
 
 
 class InertialFront:
@@ -57,8 +59,9 @@ class InertialFront:
 
     def __init__(
         self, odometry: InertialOdometry, map: Map, front_end: FrontEnd, tracker: Tracker, mapper: LocalMapper,
-        find: Finder, emit: EventSink,
+        find: Finder, emit: EventSink, see: Callable[[Frame], Sequence[TagSighting]] = lambda frame: (),
     ) -> None:  # fmt: skip
+        """see : finds the tags in a frame"""
         self.odometry = odometry
         self.map = map
         self.front_end = front_end
@@ -66,6 +69,7 @@ class InertialFront:
         self.mapper = mapper
         self.find = find
         self.emit = emit
+        self.see = see
         self.localization_only = False
         self.relocalizations = 0
         self._known = len(map.keyframes) > 0  # a map that the camera must first be found in
@@ -79,7 +83,10 @@ class InertialFront:
     def feed(self, message: Imu | Frame) -> Located | None:
         """One message; where it completes a frame, that frame."""
         clock = Stopwatch()
-        step = self.odometry.feed_frame(message) if isinstance(message, Frame) else self.odometry.feed_imu(message)
+        if isinstance(message, Frame):
+            step = self.odometry.feed_frame(message, self.see(message))
+        else:
+            step = self.odometry.feed_imu(message)
         return None if step is None else self._located(step, clock)
 
     def flush(self) -> Located | None:
@@ -123,7 +130,9 @@ class InertialFront:
         estimate = Estimate(
             t_ns, step.status, T_world_body, turn @ covariance @ turn.T, step.why, step.inliers, details
         )  # fmt: skip
-        return Located(step.frame, estimate, self._reference, T_reference_body, inserted, step.keyframe)
+        return Located(
+            step.frame, estimate, self._reference, T_reference_body, inserted, step.keyframe, step.tags
+        )  # fmt: skip
 
     def _nowhere(self, step: OdometryStep, clock: Stopwatch, why: str = "") -> Located:
         T = self.T_world_map @ step.state.T_world_body

@@ -117,7 +117,7 @@ class Slam:
         if inertial:
             odometry = InertialOdometry(rig, visual, self.config.inertial, self.emit, self.config.seed)
             self.inertial = InertialFront(
-                odometry, self.map, self.front_end, self.tracker, self.mapper, find, self.emit
+                odometry, self.map, self.front_end, self.tracker, self.mapper, find, self.emit, self.tags.see
             )  # fmt: skip
         self.live = live
         self.localization_only = False
@@ -269,9 +269,8 @@ class Slam:
             self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body))
         if located.inserted >= 0:
             self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.why, weight=1.0)
-            tags = self.tags.see(located.frame)
             with self.map.lock:
-                self.tags.note(tags, located.inserted, SE3.identity(), estimate.covariance, own=True)
+                self.tags.note(located.tags, located.inserted, SE3.identity(), estimate.covariance, own=True)
             self.mapping.submit(located.inserted)
         if not estimate.localized:
             return estimate

@@ -156,6 +156,10 @@ class Window:
         """What is known of a tag beforehand; needed before its first sighting is added."""
         self.tag_states.declare(tag)
 
+    def knows(self, tag: str) -> bool:
+        """Whether a tag was declared."""
+        return tag in self.tag_states.number
+
     def forget(self, tracks: Iterable[int]) -> None:
         """These tracks are wrong: nothing of them is used any more."""
         gone = np.fromiter(tracks, np.int64)

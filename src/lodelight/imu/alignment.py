@@ -150,7 +150,7 @@ def align(
 def _better(a: Alignment | str, b: Alignment | str) -> Alignment | str:
     if isinstance(a, str) or isinstance(b, str):
         return b if isinstance(a, str) else a
-    return a if a.rms <= b.rms else b
+    return a if a.rms * b.inliers <= b.rms * a.inliers else b
 
 
 @dataclass(eq=False)

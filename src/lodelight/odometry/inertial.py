@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lodelight.estimation.window import Observations, Solution, StartSigma, TagView, Window, WindowConfig
+from lodelight.estimation.window import Observations, Solution, StartSigma, Window, WindowConfig
 from lodelight.features.klt import KltConfig, KltTracker, Tracks
 from lodelight.geometry.se3 import SE3
 from lodelight.imu.initialization import StartConfig, Started, Starter, StartView
@@ -20,8 +20,9 @@ from lodelight.imu.preintegration import NavState
 from lodelight.imu.samples import ImuSamples
 from lodelight.imu.stream import ImuStream
 from lodelight.imu.vibration import Vibration
-from lodelight.messages import Frame, Imu, Status
+from lodelight.messages import Frame, Imu, Status, TagSighting
 from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
+from lodelight.odometry.tag_views import tag_views
 from lodelight.rig import Rig
 from lodelight.types import Array
 
@@ -62,7 +63,7 @@ class OdometryConfig:
 class OdometryStep:
     """One frame. state : T_map_body, velocity and biases; covariance (15, 15) of it
     keyframe : the reason why it is one, empty where it is none; why : of a status that is not plain tracking
-    restarted : this frame is the first of a new window
+    restarted : this frame is the first of a new window; tags : that were seen in it
     """
 
     frame: Frame
@@ -74,6 +75,7 @@ class OdometryStep:
     keyframe: str = ""
     why: str = ""
     restarted: bool = False
+    tags: tuple[TagSighting, ...] = ()
 
 
 class InertialOdometry:
@@ -99,7 +101,8 @@ class InertialOdometry:
         )  # fmt: skip
         self.window: Window | None = None
         self.restarts = 0
-        self._pending: tuple[Frame, Sequence[TagView]] | None = None
+        self._pending: tuple[Frame, Sequence[TagSighting]] | None = None
+        self._contradicted: dict[str, int] = {}  # frames in a row in which a tag did
         self._last_ns: int | None = None
         self._keyframe: LastKeyframe | None = None
         self._blind_since: int | None = None
@@ -115,7 +118,7 @@ class InertialOdometry:
             return self.flush()
         return None
 
-    def feed_frame(self, frame: Frame, tags: Sequence[TagView] = ()) -> OdometryStep | None:
+    def feed_frame(self, frame: Frame, tags: Sequence[TagSighting] = ()) -> OdometryStep | None:
         """A frame. It waits for the sample behind it, so that its time is covered; a step is that of an earlier frame
         or of this one."""
         waited = self.flush()
@@ -129,11 +132,11 @@ class InertialOdometry:
         if self._pending is None:
             return None
         (frame, tags), self._pending = self._pending, None
-        return self._step(frame, tags)
+        return replace(self._step(frame, tags), tags=tuple(tags))
 
     # -- one frame ----------------------------------------------------------------------------------------------
 
-    def _step(self, frame: Frame, tags: Sequence[TagView]) -> OdometryStep:
+    def _step(self, frame: Frame, tags: Sequence[TagSighting]) -> OdometryStep:
         imu, missing = self._imu_since_last(frame.t_ns)
         self._last_ns = frame.t_ns
         if self.window is None:
@@ -144,9 +147,12 @@ class InertialOdometry:
         predicted = window.predict(frame.t_ns, imu)
         R_now_last = self.R_body_cam.T @ predicted.T_world_body.R.T @ window.newest.T_world_body.R @ self.R_body_cam
         tracks = self.tracker.process(frame, R_now_last, sigma_rotation=2e-3)
+        views, new = tag_views(window, tags, self.rig.cameras[0], predicted.T_world_body)
         reason = self._keyframe_reason(tracks, predicted.T_world_body)
-        window.add_frame(frame.t_ns, imu, self._observations(tracks), tags, bool(reason), self._still(imu))
+        reason = reason or (f"first sight of {new[0]}" if new else "")
+        window.add_frame(frame.t_ns, imu, self._observations(tracks), views, bool(reason), self._still(imu))
         solution = window.solve()
+        self._name_wrong_tags(frame.t_ns, solution)
         state = window.newest
         inliers = len(tracks) - len(solution.outliers)
         failure = self._failure(solution, state) or self._blind(inliers, frame.t_ns)
@@ -161,6 +167,16 @@ class InertialOdometry:
         return OdometryStep(
             frame, "degraded" if blind else "tracking", state, window.covariance(), tracks, inliers, reason, why
         )
+
+    def _name_wrong_tags(self, t_ns: int, solution: Solution) -> None:
+        """Tags that the window left out twice in a row; one that hangs right may miss the test once in a hundred."""
+        for name, chi2 in solution.tag_chi2.items():
+            rejected = name in solution.tag_rejected
+            count = self._contradicted.get(name, 0) + 1 if rejected else 0
+            self._contradicted[name] = count
+            if count == 2:
+                why = f"its corners contradict the window's (chi-square {chi2:.0f}); it is not used there"
+                self.emit(t_ns, "tag", tag=name, verdict="contradicts", why=why)
 
     def _imu_since_last(self, t_ns: int) -> tuple[ImuSamples | None, str]:
         if self._last_ns is None:
