@@ -30,6 +30,10 @@ NAMED = (
     "focal length",
     "gyro unit",
     "swapped cameras",
+    "IMU shift",
+    "tag focal",
+    "tag aspect",
+    "tag squareness",
 )
 
 
@@ -72,8 +76,9 @@ def faults(seen: Seen, rig: Rig, rng: np.random.Generator) -> dict[str, Callable
         )  # fmt: skip
     if stereo or inertial:
         out["turned 3 deg"] = lambda: (seen, turned(rig, rng, 3.0, 0.0))
-    if stereo:
+    if stereo or (inertial and rig.depth is not None):
         out["shifted 3 cm"] = lambda: (seen, turned(rig, rng, 0.0, 0.03))
+    if stereo:
         out["swapped"] = lambda: (replace(seen, stereo=[(b, a) for a, b in seen.stereo]), rig)
     if inertial:
         out["focal +3 %"] = lambda: (seen, longer(rig, 1.03))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import shared_data
+from lodelight.anchors import tag_corners
 from lodelight.cli.main import main
 from lodelight.doctor import signals
 from lodelight.doctor.examine import judge
@@ -13,7 +14,7 @@ from lodelight.doctor.gather import Pair, Seen, blur_of, matched
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp, so3_log
-from lodelight.messages import Imu
+from lodelight.messages import Imu, TagSighting
 from lodelight.rig import CameraSpec, ImuSpec, Rig
 
 T0 = 1_600_000_000_000_000_000
@@ -55,7 +56,10 @@ def walk(seed=0, noise_px=0.1, seconds=4.0):
         t = k * dt - 0.6
         gyro = so3_log(body_at(t - 5e-4).R.T @ body_at(t + 5e-4).R) / 1e-3
         noise = rng.normal(scale=2.4e-3, size=3)
-        imu.append(Imu(T0 + round(t * 1e9), gyro + BIAS + noise, np.array([0.1, 0.2, 9.8])))
+        h = 2e-3
+        pull = (body_at(t - h).t - 2.0 * body_at(t).t + body_at(t + h).t) / h**2 + np.array([0.0, 0.0, 9.81])
+        accel = body_at(t).R.T @ pull + np.array([0.05, -0.1, 0.08]) + rng.normal(scale=0.03, size=3)
+        imu.append(Imu(T0 + round(t * 1e9), gyro + BIAS + noise, accel))
     pairs, stereo = [], []
     for k in range(int(seconds / 0.15)):
         a, b = 0.15 * k, 0.15 * (k + 1)
@@ -142,6 +146,50 @@ def test_a_motion_that_does_not_turn_says_so(walked):
     rest = [Imu(s.t_ns, np.zeros(3), s.accel) for s in walked.imu]
     findings = judge(replace(walked, pairs=still, imu=rest), rig())
     assert not [f for f in findings if f.level == "fault"]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_pair_three_centimetres_beside_its_place_on_the_imu_is_named(axis):
+    seen, stated = walk(1, seconds=12.0), rig()
+    cameras = [
+        replace(c, T_body_cam=SE3(c.T_body_cam.R, c.T_body_cam.t + 0.03 * np.eye(3)[axis])) for c in stated.cameras
+    ]
+    findings = {f.name: f for f in judge(seen, replace(stated, cameras=tuple(cameras)))}
+    shift = findings["IMU shift"]
+    assert {f.name for f in findings.values() if f.level == "fault"} == {"IMU shift"}
+    assert shift.value == pytest.approx(3.0, abs=1.0)
+    assert judge_shift(seen, stated).level == "ok"
+
+
+def judge_shift(seen, stated):
+    return next(f for f in judge(seen, stated) if f.name == "IMU shift")
+
+
+def tags_of(seed, count=60, noise_px=0.1):
+    """Sightings of tags of 20 cm from all sides, as the true lens shows them."""
+    rng, out = np.random.default_rng(seed), []
+    while len(out) < count:
+        turn = rng.normal(size=3)
+        T = SE3(np.diag([1.0, 1.0, 1.0]) @ so3_exp(0.7 * turn), rng.uniform([-0.5, -0.3, 0.4], [0.5, 0.3, 1.0]))
+        px, seen = LENS.project(T @ tag_corners(0.2))
+        if seen.all() and LENS.inside(px).all() and T.R[2, 2] > 0.3:
+            px = px + rng.normal(scale=noise_px, size=(4, 2))
+            out.append(TagSighting(len(out), "tag36h11", str(len(out)), px, np.full(4, noise_px)))
+    return out
+
+
+def test_tags_that_are_no_squares_tell_of_the_lens(walked):
+    seen = replace(walked, tags=tags_of(0))
+    assert faults(seen, rig()) == {}
+    for factor in (1.03, 0.97):
+        found = faults(seen, replace(rig(focal=factor), imu=None))
+        assert found["tag focal"].value == pytest.approx(100 * (1 / factor - 1), abs=0.5)
+        assert "tag aspect" not in found
+    fx, fy, cx, cy = LENS.params[:4].tolist()
+    flat = Camera.create("radtan", 752, 480, (fx, 1.03 * fy, cx, cy), LENS.distortion)
+    one = replace(rig(), cameras=(replace(rig().cameras[0], camera=flat),), imu=None)
+    found = faults(replace(seen, pairs=[], stereo=[]), one)
+    assert found["tag aspect"].value == pytest.approx(3.0, abs=0.5)
 
 
 # -- one sensor by itself ----------------------------------------------------------------------------------------------

@@ -9,16 +9,19 @@ import numpy as np
 from lodelight.doctor import pair_of_eyes, signals
 from lodelight.doctor.findings import Finding, measured
 from lodelight.doctor.gather import BUDGET_FRAMES, STRETCH_S, Seen, gather
-from lodelight.doctor.metric import field_of, move_of
+from lodelight.doctor.lever import lever_of
+from lodelight.doctor.metric import Move, field_of, move_of
+from lodelight.doctor.squares import squares_of
 from lodelight.doctor.turning import Gyro, align, turn_of
 from lodelight.io.recording import Recording
 from lodelight.io.stamps import NS_PER_S
 from lodelight.messages import Imu
-from lodelight.rig import Rig
+from lodelight.rig import CameraSpec, Rig
 from lodelight.types import Array
 
 # Limits: half of what spoils a run, and above what good recordings of known rigs show (docs/doctor.md).
 OFFSET_MS, TURN_DEG, FOCAL, EPIPOLAR_PX, AIM_CM, REGION_PX = 3.5, 1.3, 0.018, 1.0, 1.0, 1.0
+SHIFT_CM, SQUARE_PX, ASPECT = 2.0, 1.0, 0.015
 DEGREES = (40.0, 80.0)  # what a gyro in degrees shows over what vision does
 
 
@@ -61,8 +64,11 @@ def judge(seen: Seen, rig: Rig, recording: Recording | None = None) -> list[Find
     out += eyes
     if swapped:
         return out  # the images are those of the other camera: nothing further would be about this rig
+    out += _squares(seen, rig)
+    cam0, cam1 = rig.cameras[0], rig.cameras[1] if len(rig.cameras) > 1 else None
     wrong = any(f.level == "fault" for f in eyes)  # points of a wrong pair would miss everywhere
-    return out + ([] if wrong else _regions(seen, rig)) + _turning(seen, rig)
+    moves = [] if wrong else [m for pair in seen.pairs if (m := move_of(pair, cam0, cam1)) is not None]
+    return out + _regions(moves, cam0) + _turning(seen, rig, moves)
 
 
 def _eyes(seen: Seen, rig: Rig) -> tuple[list[Finding], bool]:
@@ -116,9 +122,30 @@ def _cost(found: pair_of_eyes.Eyes) -> float:
     return found.miss_px + 3.0 * found.behind
 
 
-def _regions(seen: Seen, rig: Rig) -> list[Finding]:
-    cam0, cam1 = rig.cameras[0], rig.cameras[1] if len(rig.cameras) > 1 else None
-    moves = [move for pair in seen.pairs if (move := move_of(pair, cam0, cam1)) is not None]
+def _squares(seen: Seen, rig: Rig) -> list[Finding]:
+    found = squares_of(seen.tags, rig.cameras[0].camera)
+    if found is None:
+        return []
+    text = f"corners of {found.sightings} tags leave {found.left_px:.2f} px of a square in the median"
+    bad = found.left_px > SQUARE_PX
+    if bad:
+        text = f"lens: {text}; calibrate it anew, or print the tags on something flat"
+    out = [Finding("tag squareness", "fault" if bad else "ok", text, found.left_px, "px")]
+    for name, value, sigma, limit in (
+        ("tag focal", found.focal, found.sigma_focal, FOCAL), ("tag aspect", found.aspect, found.sigma_aspect, ASPECT),
+    ):  # fmt: skip
+        what = "focal length" if name == "tag focal" else "fx over fy"
+        out.append(
+            measured(
+                name, 100 * value, 100 * sigma, 100 * limit, "%",
+                f"tags are square with the rig's {what}, to {{value:.2f}} % (+- {{sigma:.2f}})",
+                f"{what}: by the tags the true one is {{value:+.1f}} % (+- {{sigma:.1f}}) off; calibrate anew",
+            )
+        )  # fmt: skip
+    return out
+
+
+def _regions(moves: list[Move], cam0: CameraSpec) -> list[Finding]:
     if not moves:
         return []
     worst, _ = field_of(moves, cam0.camera)
@@ -126,8 +153,8 @@ def _regions(seen: Seen, rig: Rig) -> list[Finding]:
     return [Finding("lens by region", "fault" if worst > REGION_PX else "ok", text, worst, "px")]
 
 
-def _turning(seen: Seen, rig: Rig) -> list[Finding]:
-    """Vision against the gyro: unit, time offset, extrinsics, focal length."""
+def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
+    """Vision against the IMU: unit, time offset, extrinsics, focal length."""
     if rig.imu is None or len(seen.imu) < 10:
         return []
     lens, R_body_cam = rig.cameras[0].camera, rig.cameras[0].T_body_cam.R
@@ -175,6 +202,19 @@ def _turning(seen: Seen, rig: Rig) -> list[Finding]:
             "focal length: the true one is {value:+.1f} % (+- {sigma:.1f}) off the rig's, by the gyro; calibrate anew",
         )
     )  # fmt: skip
+    if any(f.level == "fault" for f in out):
+        return out  # a lever would be found by what is wrong otherwise
+    lever = lever_of(moves, seen.imu, rig.imu, rig.cameras[0], found)
+    if lever is not None:
+        shift_m, sigma_m = lever.told(0.01 * SHIFT_CM / 2.0)
+        out.append(
+            measured(
+                "IMU shift", 100 * shift_m, 100 * sigma_m, SHIFT_CM, "cm",
+                "cam0 sits on the IMU where the rig says, to {value:.1f} cm (+- {sigma:.1f})",
+                "extrinsics: cam0 sits {value:.1f} cm (+- {sigma:.1f}) beside where the rig says; "
+                "measure T_body_cam anew",
+            )
+        )  # fmt: skip
     return out
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from lodelight.io.recording import Recording
 from lodelight.io.stamps import NS_PER_S
-from lodelight.messages import Frame, Imu
+from lodelight.messages import Frame, Imu, TagSighting
+from lodelight.tags.detect import TagDetector
 from lodelight.types import Array, ArrayF32, Bytes
 
 MOMENT_S = 0.15  # between the frames of a pair: long enough to turn, short enough to be tracked
@@ -21,6 +22,7 @@ CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 STRETCH_S, BUDGET_FRAMES = 4.0, 360
 RETURN_PX = 0.5  # by how much a corner may miss itself when it is tracked there and back
 ORB_EVERY, N_ORB = 8, 800
+TAGS_EVERY, TAGS = 6, ("qr", "tag36h11")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class Seen:
 
     pairs : those of one stretch follow one another, each beginning where the last one ended
     stereo : matched corners of frames, (N, 2) px in camera 0 and in camera 1, found without the rig
+    tags : of TAGS in every TAGS_EVERYth frame
     brightness : (mean, share that is black, share that is white) of frames; sharpness : `blur_of` them
     """
 
@@ -50,6 +53,7 @@ class Seen:
     blur: list[float] = field(default_factory=list)
     imu: list[Imu] = field(default_factory=list)
     t_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    tags: list[TagSighting] = field(default_factory=list)
 
 
 def gather(recording: Recording, stretches: list[tuple[float, float]]) -> Iterator[tuple[Seen, int]]:
@@ -58,6 +62,7 @@ def gather(recording: Recording, stretches: list[tuple[float, float]]) -> Iterat
     rig = recording.rig
     period_s = 1.0 / rig.cameras[0].rate_hz if rig.cameras[0].rate_hz > 0 else 0.05
     gap = max(1, round(MOMENT_S / period_s))
+    detector = TagDetector(rig.cameras[0].camera, TAGS)
     count = 0
     for start_s, end_s in stretches:
         open_pair: _Tracking | None = None
@@ -66,6 +71,8 @@ def gather(recording: Recording, stretches: list[tuple[float, float]]) -> Iterat
             if i % 4 == 0:
                 seen.brightness.append(brightness_of(frame.images[0]))
                 seen.blur.append(blur_of(frame.images[0]))
+            if i % TAGS_EVERY == 0:
+                seen.tags += detector.detect(frame.images[0], frame.t_ns, thorough=True)
             if len(frame.images) > 1 and i % ORB_EVERY == 0:
                 seen.stereo.append(matched(frame.images[0], frame.images[1]))
             if open_pair is not None:
