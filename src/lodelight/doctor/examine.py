@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from lodelight.doctor.gather import BUDGET_FRAMES, STRETCH_S, Seen, gather
 from lodelight.doctor.lever import lever_of
 from lodelight.doctor.metric import Move, field_of, move_of
 from lodelight.doctor.squares import squares_of
-from lodelight.doctor.turning import Gyro, align, turn_of
+from lodelight.doctor.turning import Gyro, Turn, align, turn_of
 from lodelight.io.recording import Recording
 from lodelight.io.stamps import NS_PER_S
 from lodelight.messages import Imu
@@ -168,7 +169,8 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             "multiply it by 0.0174533"
         )
         out.append(Finding("gyro unit", "fault", text, 1.0 / found.rate_ratio))
-        found = align(turns, Gyro(t_ns, np.radians(rate)), R_body_cam)
+        rate = np.radians(rate)
+        found = align(turns, Gyro(t_ns, rate), R_body_cam)
     if found is None:
         return [*out, Finding("camera and IMU", "note", "the body turned too little to hold vision against the gyro")]
     if found.correlation < 0.7 or found.residual_rad > 0.02:
@@ -179,14 +181,16 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             *out,
             Finding("camera and IMU", "fault" if found.correlation < 0.5 else "note", text, found.correlation),
         ]
-    out.append(
-        measured(
-            "time offset", 1e3 * found.offset_s, 1e3 * found.sigma_offset_s, OFFSET_MS, "ms",
-            "images and IMU agree to {value:.1f} ms (+- {sigma:.1f})",
-            "time offset: images are stamped {value:+.1f} ms (+- {sigma:.1f}) wrong against the IMU; "
-            "add it to the cameras' time_offset_s",
-        )
+    offset = measured(
+        "time offset", 1e3 * found.offset_s, 1e3 * found.sigma_offset_s, OFFSET_MS, "ms",
+        "images and IMU agree to {value:.1f} ms (+- {sigma:.1f})",
+        "time offset: images are stamped {value:+.1f} ms (+- {sigma:.1f}) wrong against the IMU; "
+        "add it to the cameras' time_offset_s",
     )  # fmt: skip
+    if offset.level == "fault" and not _in_both_halves(turns, Gyro(t_ns, rate), R_body_cam, found.offset_s):
+        text = f"{offset.value:+.1f} ms (+- {offset.sigma:.1f}), but only a part of the recording shows it: turn more"
+        offset = replace(offset, level="note", text=text)
+    out.append(offset)
     turn_deg, sigma_deg = _sure(np.degrees(found.turn_rad), np.degrees(found.sigma_turn_rad))
     out.append(
         measured(
@@ -216,6 +220,16 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             )
         )  # fmt: skip
     return out
+
+
+def _in_both_halves(turns: list[Turn], gyro: Gyro, R_body_cam: Array, offset_s: float) -> bool:
+    """Whether each half of the recording, by itself, shows half of an offset at least: clocks are off all the time."""
+    middle = len(turns) // 2
+    for half in (turns[:middle], turns[middle:]):
+        found = align(half, gyro, R_body_cam)
+        if found is None or found.offset_s * offset_s < 0.5 * offset_s**2:
+            return False
+    return True
 
 
 def _sure(turn: Array, sigma: Array) -> tuple[float, float]:
