@@ -110,19 +110,26 @@ def _turned_pairs() -> AnyArray:
     return out
 
 
-@kernel
 def spread(px: Ints, response: ArrayF32, cell_px: float, width: int, height: int, quota: int) -> Ints:
     """Indices of at most `quota` corners, taken round by round: the best of every cell, the second best, and so on."""
+    order = np.argsort(-response, kind="stable").astype(np.int32)
+    rounds = _rounds(px, order, cell_px, width, height)
+    out: Ints = order[np.argsort(rounds, kind="stable")[:quota]]
+    return out
+
+
+@kernel
+def _rounds(px: Ints, order: Ints, cell_px: float, width: int, height: int) -> Ints:
+    """(N,) how many corners of its own cell come before each corner of `order`."""
     columns = int(width / cell_px) + 1
     taken = np.zeros(columns * (int(height / cell_px) + 1), np.int32)
-    order = np.argsort(-response, kind="mergesort")
-    rank = np.empty(len(px), np.int32)
-    for i in order:
+    out = np.empty(len(order), np.int32)
+    for k in range(len(order)):
+        i = order[k]
         cell = int(px[i, 1] / cell_px) * columns + int(px[i, 0] / cell_px)
-        rank[i] = taken[cell]
+        out[k] = taken[cell]
         taken[cell] += 1
-    by_rank = order[np.argsort(rank[order], kind="mergesort")]
-    return by_rank[:quota].astype(np.int32)
+    return out
 
 
 @kernel

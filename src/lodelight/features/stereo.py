@@ -52,7 +52,8 @@ class StereoMatcher:
         nearest = 1.0 / self.config.nearest_m
         T, scale = self.T_right_left, self.orb.scale_factor
         curve = _curves(seen.ray, T.R, T.t, self.right.model, self.right.params, nearest)
-        match = _match_along(curve, seen.octave, seen.desc, there.px, there.octave, there.desc, scale)
+        order = np.argsort(there.px[:, 1], kind="stable").astype(np.int32)
+        match = _match_along(curve, seen.octave, seen.desc, there.px, order, there.octave, there.desc, scale)
         tangent = _left_tangents(seen.ray, seen.px, T.R.T @ T.t, self.left.model, self.left.params)
         shift_px, difference = np.zeros(len(seen)), np.full(len(seen), np.inf)
         for octave, (left, right) in enumerate(zip(left_pyramid, right_pyramid, strict=False)):
@@ -138,11 +139,14 @@ def _nearest_on_curve(curve: Array, u: float, v: float) -> tuple[float, float, f
 
 @kernel
 def _match_along(
-    curve: Array, octave: Ints, desc: Words, px: ArrayF32, there_octave: Ints, there_desc: Words, scale_factor: float
-) -> Ints:
-    """For every left corner the right one on its curve with the nearest descriptor, none taken twice, or -1."""
+    curve: Array, octave: Ints, desc: Words, px: ArrayF32, order: Ints, there_octave: Ints, there_desc: Words,
+    scale_factor: float,
+) -> Ints:  # fmt: skip
+    """For every left corner the right one on its curve with the nearest descriptor, none taken twice, or -1.
+
+    order : (M,) the right corners by rising row
+    """
     n, m = len(curve), len(px)
-    order = np.argsort(px[:, 1], kind="mergesort")
     rows = px[:, 1][order]
     match = np.full(n, -1, np.int32)
     owner = np.full(m, -1, np.int32)
