@@ -164,7 +164,10 @@ def against(run: Query, path: Trajectory, truth: Trajectory) -> None:
 def pair(given: argparse.Namespace) -> None:
     map, T_map_truth = loaded(given)
     query = open_source(given.query)
-    run = Query(query.rig, map, query.messages("mono", end_s=given.end), given)
+    if given.gaps_m:
+        make_gaps(map, given.gaps_m)
+    rig, frames = shrunk(query.rig, query.messages("mono", end_s=given.end), given.scale)
+    run = Query(rig, map, frames, given)
     print(f"{query.name} in {given.run}, {len(map.alive_keyframes)} keyframes: {run.told()}")
     off, turn, status = run.errors(T_map_truth, query.ground_truth())
     print(f"  median {np.median(off):.4f} m {np.median(turn):.3f} deg, p95 {np.percentile(off, 95):.3f} m")
@@ -177,6 +180,34 @@ def pair(given: argparse.Namespace) -> None:
     if given.verbose:
         print(*((e.t_ns, e.status, e.inliers, int(e.details["temporary"]), e.why) for e in run.estimates), sep="\n")
         print(*run.events, sep="\n")
+
+
+def shrunk(rig, frames, scale: float):
+    """The recording of a camera with fewer pixels."""
+    if scale == 1.0:
+        return rig, frames
+    camera = rig.cameras[0].camera
+    size, params = (round(camera.width * scale), round(camera.height * scale)), camera.params.copy()
+    params[:2] *= scale
+    params[2:4] = (params[2:4] + 0.5) * scale - 0.5
+    lens = replace(camera, width=size[0], height=size[1], params=params)
+    small = (
+        Frame(f.t_ns, (cv2.resize(f.images[0], size, interpolation=cv2.INTER_AREA),))
+        for f in frames
+        if isinstance(f, Frame)
+    )
+    return replace(rig, cameras=(replace(rig.cameras[0], camera=lens),)), small
+
+
+def make_gaps(map: Map, length_m: float) -> None:
+    """Take out of a map what is seen mostly from every other stretch of the way: as if all had been replaced there."""
+    alive = map.alive_keyframes
+    way_m = np.zeros(len(map.keyframes))
+    way_m[alive[1:]] = np.cumsum(np.linalg.norm(np.diff(map.keyframes.p[alive], axis=0), axis=1))
+    gap = (way_m // length_m).astype(int) % 2 == 1
+    gone = [p for p in map.alive_points if gap[map.features.keyframe[map.observations(int(p))]].mean() > 0.5]
+    print(f"{len(gone)} of {len(map.alive_points)} points taken out of the map")
+    map.remove_points(np.array(gone))
 
 
 def wrong(given: argparse.Namespace) -> None:
@@ -307,7 +338,10 @@ def main() -> None:
     parser = task("blocks", blocks, "recording")
     parser.add_argument("--length", type=int, default=30)
     parser.add_argument("--against-slam", action="store_true", help="not the truth, but SLAM over all frames")
-    task("pair", pair, "run", "recording", "query").add_argument("--end", type=float, default=float("inf"))
+    parser = task("pair", pair, "run", "recording", "query")
+    parser.add_argument("--end", type=float, default=float("inf"))
+    parser.add_argument("--scale", type=float, default=1.0, help="of the query's images")
+    parser.add_argument("--gaps-m", type=float, default=0.0, help="take every other stretch so long out of the map")
     parser = task("wrong", wrong, "run", "recording", "query")
     parser.add_argument("others", type=Path, nargs="*")
     parser.add_argument("--every", type=int, default=1)

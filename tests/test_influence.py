@@ -6,7 +6,7 @@ import pytest
 from corridors import ORB, OTHER, Corridor
 from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
-from lodelight.localization.follower import Follower
+from lodelight.localization.follower import Follower, _right
 from lodelight.localization.influence import MOST, leverage
 from lodelight.localization.temporary import TemporaryConfig, TemporaryPoints
 from lodelight.localization.tracker import TrackerConfig
@@ -63,3 +63,25 @@ def test_a_point_that_is_not_where_it_was_mapped_does_not_move_the_pose_however_
     off_m = np.linalg.norm(solved.T_world_body.t - TRUE.t)
     assert off_m < 3.5 * np.sqrt(np.trace(solved.covariance[3:, 3:]))
     assert not solved.inliers[-1]
+
+
+@pytest.mark.parametrize("noise", [1.0, 1.5, 2.0])
+def test_matches_that_agree_by_chance_are_not_counted(noise):
+    rng = np.random.default_rng(round(10 * noise))
+    window = 7.5
+
+    def chi2(n_right, n_wrong):
+        right = noise * rng.normal(size=(n_right, 2))
+        at, angle = window * np.sqrt(rng.random(n_wrong)), rng.uniform(0.0, 2.0 * np.pi, n_wrong)
+        wrong = at[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.sum(np.vstack([right, wrong]) ** 2, axis=1)
+
+    def counted(n_right, n_wrong):
+        some = chi2(n_right, n_wrong)
+        return _right(some, some < 5.991 * 16.0, window)  # by the bound of four times the noise, as of a blurred frame
+
+    by_chance = [counted(0, 120) for _ in range(50)]
+    assert np.mean(by_chance) < 15
+    assert max(by_chance) < 40
+    found = [counted(90, 40) for _ in range(50)]
+    assert 0.6 * 90 < np.mean(found) < 1.15 * 90

@@ -67,6 +67,17 @@ def test_drift_is_borne_with_for_so_long_and_no_longer():
     assert Step.lost not in judged(followed(max_carried_s=2.0), [(60, 100)] * 50)
 
 
+def test_a_way_without_any_known_distance_is_borne_with_for_a_metre():
+    states = followed()
+    judged(states, [(60, 60), (60, 60)])
+    steps = [states.judge((20 + i) * S, 0, 150, 0.1, measured=29) for i in range(11)]
+    assert steps == [Step.keep] * 10 + [Step.lost]
+    assert "no distance is known" in states.why
+    states = followed()
+    judged(states, [(60, 60), (60, 60)])
+    assert {states.judge((20 + i) * S, 0, 150, 0.1, measured=30) for i in range(12)} == {Step.keep}
+
+
 def test_without_temporary_points_the_camera_is_followed_down_to_n2():
     states = States(StatesConfig(), carrying=False)
     states.found(0)

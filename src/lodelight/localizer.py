@@ -26,6 +26,7 @@ from lodelight.rig import Rig
 from lodelight.types import Array
 
 DRIFT = 0.02  # of the way without the map, one standard deviation; science note B3
+GUESSED = 0.5  # of the way without anything whose distance is known
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,8 @@ class Localizer:
         known: Array = self.map.keyframes.covariance[tracked.reference]
         total = tracked.covariance + carried_covariance(self.map.pose(tracked.reference), known, tracked.T_world_body)
         if self.ladder.states.state is State.carried:
-            total[3:, 3:] += (DRIFT * self.ladder.states.carried_m) ** 2 * np.eye(3)
+            states = self.ladder.states
+            total[3:, 3:] += ((DRIFT * states.carried_m) ** 2 + (GUESSED * states.guessed_m) ** 2) * np.eye(3)
         return total
 
 

@@ -7,8 +7,11 @@ for one of the map's. A finished `Tracked` has the two kinds apart.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
+from lodelight.estimation.factors.reprojection import CHI2_PX
 from lodelight.estimation.pose import PoseResult
 from lodelight.features.features import Features
 from lodelight.features.matching import FeatureIndex
@@ -17,14 +20,16 @@ from lodelight.geometry.se3 import SE3
 from lodelight.localization.influence import MOST, leverage
 from lodelight.localization.motion import Motion
 from lodelight.localization.temporary import TemporaryPoints
-from lodelight.localization.tracker import Landmarks, Tracked, Tracker, TrackerConfig
+from lodelight.localization.tracker import INLIERS, MAJORITY, NARROW, Landmarks, Tracked, Tracker, TrackerConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import in_sight, keyframes_near, local_keyframes, points_of_keyframes
 from lodelight.rig import Rig
-from lodelight.types import Array, Ints
+from lodelight.types import Array, Bools, Ints
 
 FIRST_TEMPORARY = -2
 ENOUGH_VOTES = 30  # matches with the map, from which its own covisibility says best what is around
+NOISES = (1.0, 1.4, 2.0)  # of a frame over a sharp one's, at which right matches are told from wrong ones
+ENOUGH_MEASURED = 30  # points whose distance is known, which do without the others
 MOST_DECIDING = 5  # points that decide a pose alone, in one frame
 NEAR_M, NEAR_DEG, NEAREST = 8.0, 60.0, 20  # else keyframes from so near, turned by so little, at most so many
 
@@ -75,37 +80,62 @@ class Follower(Tracker):
         mapped = np.where(point >= 0, point, -1).astype(np.int32)
         mapped = self._matched(sight, map.points.desc[sight.point], mapped, mapped < 0, index, search)
         carried = np.where((point <= FIRST_TEMPORARY) & (mapped < 0), FIRST_TEMPORARY - point, -1).astype(np.int32)
-        overlay = self.temporary.table
-        use_overlay = not map_alone and len(overlay) > 0
+        use_overlay = not map_alone and len(self.temporary.table) > 0
         if map_alone:
             carried[:] = -1
         if use_overlay:
             around = self.temporary.in_sight(T_world_body)
             free = (mapped < 0) & (carried < 0)
-            carried = self._matched(around, overlay.desc[around.point], carried, free, index, search)
-        used = np.flatnonzero((mapped >= 0) | (carried >= 0))
-        of_map = mapped[used] >= 0
-        xyz = np.empty((len(used), 3))
-        xyz[of_map] = map.points.xyz[mapped[used[of_map]]]
-        xyz[~of_map] = overlay.xyz[carried[used[~of_map]]]
-        weight = np.where(of_map, 1.0, self.temporary.config.weight)
-        spread, prior = np.zeros(len(used)), None
-        if not of_map.all():
-            centre = (T_world_body @ self.T_body_cam).t
-            spread[~of_map] = self.camera.focal_px * self.temporary.uncertainty(carried[used[~of_map]], centre)
-            prior = self._expected(t_ns)
-        solved, noise = self._solve_without_leverage(T_world_body, seen.take(used), xyz, weight, spread, prior)
-        wrong = used[~solved.inliers]
-        mapped[wrong], carried[wrong] = -1, -1
+            carried = self._matched(around, self.temporary.table.desc[around.point], carried, free, index, search)
+        posed = partial(self._posed, t_ns, seen, T_world_body, reference=int(voting[0]), window=NARROW * search)
+        tracked = posed(mapped, carried)
+        if tracked.right_in_map < MAJORITY * tracked.n_inliers and np.any(carried >= 0):  # by chance, for the most part
+            mapped = np.full(len(seen), -1, np.int32)
+            tracked = posed(mapped, carried)
+        if tracked.measured < ENOUGH_MEASURED and np.any(carried >= 0):
+            tracked = posed(mapped, carried, guess=True)
         if use_overlay:
-            self.temporary.count(around.point, carried[carried >= 0])
-            carried = self.temporary.alive(carried)
-        tracked = Tracked(
-            t_ns, seen, solved.T_world_body, solved.covariance, mapped, int(voting[0]), noise, temporary=carried
-        )
-        if solved.n_inliers < self.config.min_inliers:
-            tracked.why_lost = f"{solved.n_inliers} of {len(used)} matches with the local map are inliers"
+            assert tracked.temporary is not None
+            self.temporary.count(around.point, tracked.temporary[tracked.temporary >= 0])
+            tracked.temporary = self.temporary.alive(tracked.temporary)
         return tracked
+
+    def _posed(
+        self, t_ns: int, seen: Features, start: SE3, mapped: Ints, carried: Ints, window: float, reference: int,
+        guess: bool = False,
+    ) -> Tracked:  # fmt: skip
+        """The pose by matches of both kinds (N,), each found within `window` sigmas of where it was expected.
+
+        guess : by those whose distance is not known, too; else they are only tested
+        """
+        used = np.flatnonzero((mapped >= 0) | (carried >= 0))
+        of_map, with_distance = mapped[used] >= 0, mapped[used] >= 0
+        xyz, spread = np.empty((len(used), 3)), np.zeros(len(used))
+        xyz[of_map] = self.map.points.xyz[mapped[used[of_map]]]
+        prior = None
+        if not of_map.all():
+            others = carried[used[~of_map]]
+            xyz[~of_map] = self.temporary.table.xyz[others]
+            with_distance[~of_map] = self.temporary.measured(others)
+            centre = (start @ self.T_body_cam).t
+            spread[~of_map] = self.camera.focal_px * self.temporary.uncertainty(others, centre)
+            prior = self._expected(t_ns)
+        weight = np.where(of_map, 1.0, np.where(with_distance | guess, self.temporary.config.weight, 0.0))
+        solved, noise = self._solve_without_leverage(start, seen.take(used), xyz, weight, spread, prior)
+        chi2 = noise**2 * solved.chi2
+        in_map, in_all, measured = (
+            _right(chi2[those], solved.inliers[those], window * self.config.sigma_px)
+            for those in (of_map, np.ones(len(used), np.bool_), with_distance)
+        )
+        point, temporary = np.full(len(seen), -1, np.int32), np.full(len(seen), -1, np.int32)
+        agree = used[solved.inliers]
+        point[agree], temporary[agree] = mapped[agree], np.where(mapped[agree] >= 0, -1, carried[agree])
+        why = f"{in_all} of {len(used)} matches with the local map agree beyond chance"
+        return Tracked(
+            t_ns, seen, solved.T_world_body, solved.covariance, point, reference, noise, temporary=temporary,
+            right_in_map=in_map, right_in_all=in_all, measured=measured,
+            why_lost=why if in_all < self.config.min_inliers else "",
+        )  # fmt: skip
 
     def _solve_without_leverage(
         self, start: SE3, seen: Features, xyz: Array, weight: Array, spread: Array, prior: tuple[SE3, Array] | None
@@ -169,6 +199,23 @@ class Follower(Tracker):
             np.append(known.octave, seen.octave),
             np.append(known.angle, seen.angle),
         )
+
+
+def _right(chi2: Array, inliers: Bools, window: float) -> int:
+    """How many of the inliers are right, going by how many more there are than if none were.
+
+    chi2 : (N,) of all matches by a sharp frame's noise; window : sigmas around its prediction in which each was found
+
+    Wrong matches lie anywhere in their windows. Whatever the noise, right ones lie nearer the middle; so they are
+    counted within the bounds of several noises, none of which leaves more to chance than half of the window.
+    """
+    most = 0.0
+    for noise in NOISES:
+        bound = CHI2_PX * noise**2
+        chance = bound / window**2
+        if chance < 0.5:
+            most = max(most, (np.count_nonzero(chi2 <= bound) - chance * len(chi2)) / (INLIERS - chance))
+    return min(round(most), int(np.count_nonzero(inliers)))
 
 
 def n_temporary(tracked: Tracked) -> int:

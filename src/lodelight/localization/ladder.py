@@ -136,10 +136,9 @@ class Ladder:
         last = self.follower.last
         assert last is not None
         tracked = self.follower.track(t_ns, seen)
-        in_map = 0 if tracked.why_lost else tracked.n_inliers
-        in_all = in_map + (0 if tracked.why_lost else n_temporary(tracked))
+        in_map, in_all = (0, 0) if tracked.why_lost else (tracked.right_in_map, tracked.right_in_all)
         moved_m = float(np.linalg.norm(tracked.T_world_body.t - last.T_world_body.t))
-        step = self.states.judge(t_ns, in_map, in_all, moved_m)
+        step = self.states.judge(t_ns, in_map, in_all, moved_m, tracked.measured)
         if step is Step.lost:
             self._give_up(t_ns)
             return None
@@ -149,9 +148,11 @@ class Ladder:
             tracked = self._leave(tracked, tracked.T_world_body, "the map is enough again")
         if step is Step.enter:
             self.emit(t_ns, "carried", begins=True, why=self.states.why)
-        well = tracked.n_inliers >= self.config.states.good_inliers
+        well = tracked.right_in_map >= self.config.states.good_inliers
         if self.states.state is State.carried:
-            self.temporary.grow(tracked, self.follower.distances(tracked))
+            self.temporary.grow(
+                tracked, self.follower.distances(tracked), tracked.measured >= self.config.states.min_inliers
+            )
             if self.temporary.remember(tracked, well):
                 adjust_window(self.temporary, self.map, tracked, self.config.tracking.sigma_px)
             tracked = self._look_beside(tracked)
@@ -218,7 +219,7 @@ class Ladder:
         corrected = correction @ tracked.T_world_body
         nothing = np.full(len(tracked.seen), -1, np.int32)
         alone = self._by_map_alone(tracked, corrected, nothing)
-        if alone.why_lost or alone.n_inliers < max(self.config.states.min_inliers, tracked.n_inliers):
+        if alone.why_lost or alone.right_in_map < max(self.config.states.min_inliers, tracked.right_in_map):
             return tracked
         jump_m = float(np.linalg.norm(alone.T_world_body.t - tracked.T_world_body.t))
         why = f"{found.why} beside, twice alike" if isinstance(found, Found) else ""
@@ -230,7 +231,7 @@ class Ladder:
     def _question(self, tracked: Tracked) -> Question:
         look = self.config.second_look
         hint = Hint(tracked.T_world_body, look.reach_m + 0.03 * self.states.carried_m)
-        return Question(tracked.t_ns, tracked.seen, tracked.T_world_body, tracked.n_inliers, hint)
+        return Question(tracked.t_ns, tracked.seen, tracked.T_world_body, tracked.right_in_map, hint)
 
     def _answer(self, question: Question) -> tuple[Question, Found | str]:
         return question, self.relocalizer.find(question.seen, question.hint)
@@ -264,10 +265,10 @@ class Ladder:
         look = self.config.second_look
         asked = Tracked(t_ns, seen, found.T_world_body, found.covariance, found.point, 0)
         tracked = self._by_map_alone(asked, found.T_world_body, found.point)
-        if tracked.why_lost or tracked.n_inliers < self.config.states.min_inliers:
-            return self._nowhere(t_ns, seen, f"{found.why}, but {tracked.n_inliers} on a second look")
+        if tracked.why_lost or tracked.right_in_map < self.config.states.min_inliers:
+            return self._nowhere(t_ns, seen, f"{found.why}, but {tracked.right_in_map} on a second look")
         waiting: list[Tracked] = []
-        if tracked.n_inliers < look.inliers:
+        if tracked.right_in_map < look.inliers:
             if not self._pending or not self._explained(self._pending[-1], tracked):
                 self._pending = [tracked]
                 return self._nowhere(t_ns, seen, f"{found.why}, too few to be believed before it is found again")
@@ -313,7 +314,7 @@ class Ladder:
         self.follower.accept(tracked)
         self.temporary.forget_past()
         self.states.found(tracked.t_ns)
-        self.status, self.why = "relocalized", f"{why}; {tracked.n_inliers} on a second look"
+        self.status, self.why = "relocalized", f"{why}; {tracked.right_in_map} on a second look"
         self.emit(tracked.t_ns, "relocalization", why=self.why, inliers=tracked.n_inliers)
         return tracked
 

@@ -45,6 +45,7 @@ class StatesConfig:
     carried_inliers : points of both kinds with which a carried frame has a pose
     after_found_inliers : the same within after_found_s of having been found, when the motion is not known yet
     max_carried_s, max_carried_m : how long drift is borne with
+    max_guessed_m : the same, where all that is seen has no distance
     """
 
     good_inliers: int = 90
@@ -55,6 +56,7 @@ class StatesConfig:
     after_found_s: float = 1.0
     max_carried_s: float = 60.0
     max_carried_m: float = 30.0
+    max_guessed_m: float = 1.0
 
 
 class States:
@@ -67,7 +69,8 @@ class States:
         self.why = ""
         self.poor = 0  # frames in a row below N1
         self.weak = 0  # frames in a row without a pose that can be believed
-        self.carried_m = 0.0
+        self.carried_m = 0.0  # since the map last held the pose, if only just
+        self.guessed_m = 0.0  # of it, without enough points whose distance is known
         self._found_ns = 0
         self._held_ns = 0  # when the map last held the pose, if only just
 
@@ -77,13 +80,14 @@ class States:
         self.poor = self.weak = 0
         self._found_ns = t_ns
 
-    def judge(self, t_ns: int, in_map: int, in_all: int, moved_m: float) -> Step:
+    def judge(self, t_ns: int, in_map: int, in_all: int, moved_m: float, measured: int | None = None) -> Step:
         """What follows from a frame.
 
         in_map, in_all : points of the map, and of both kinds, that agree with its pose; moved_m : since the last frame
+        measured : those of both kinds whose distance is known, all where None
         """
         if self.state is State.carried:
-            return self._carried(t_ns, in_map, in_all, moved_m)
+            return self._carried(t_ns, in_map, in_all, moved_m, in_all if measured is None else measured)
         c = self.config
         self.poor = 0 if in_map >= c.good_inliers else self.poor + 1
         if in_map < c.min_inliers:
@@ -92,6 +96,7 @@ class States:
         self.why = f"{in_map} points of the map agree, fewer than {c.good_inliers}" if self.poor else ""
         if self.carrying and self.poor >= c.patience:
             self.state, self._held_ns, self.carried_m = State.carried, t_ns, 0.0
+            self.guessed_m = 0.0
             return Step.enter
         return Step.keep
 
@@ -100,12 +105,13 @@ class States:
         self.state, self.why = State.following, why
         self.poor = self.weak = 0
 
-    def _carried(self, t_ns: int, in_map: int, in_all: int, moved_m: float) -> Step:
+    def _carried(self, t_ns: int, in_map: int, in_all: int, moved_m: float, measured: int) -> Step:
         c = self.config
         if in_map >= c.min_inliers:
-            self._held_ns, self.carried_m = t_ns, 0.0
+            self._held_ns, self.carried_m, self.guessed_m = t_ns, 0.0, 0.0
         else:
             self.carried_m += moved_m
+            self.guessed_m += moved_m if measured < c.min_inliers else 0.0
         if in_map >= c.good_inliers:
             self.leave("")
             return Step.leave
@@ -116,6 +122,8 @@ class States:
         carried_s = (t_ns - self._held_ns) * 1e-9
         if carried_s > c.max_carried_s or self.carried_m > c.max_carried_m:
             return self._lost(f"carried for {carried_s:.0f} s and {self.carried_m:.0f} m without the map")
+        if self.guessed_m > c.max_guessed_m:
+            return self._lost(f"carried for {self.guessed_m:.1f} m by points of which no distance is known")
         self.weak = 0
         self.why = (
             f"mono: {in_map} points of the map agree, fewer than {c.good_inliers}, and {in_all - in_map} temporary"

@@ -150,17 +150,19 @@ class TemporaryPoints:
 
     # -- how they are made --------------------------------------------------------------------------------------
 
-    def grow(self, tracked: Tracked, distance_m: Array) -> int:
+    def grow(self, tracked: Tracked, distance_m: Array, measured: bool) -> int:
         """New points from what a frame sees and nothing explains yet; its `temporary` names them. Returns how many.
 
-        distance_m : (K,) of the points of the map that it sees
+        distance_m : (K,) of the points of the map that it sees; measured : whether where it was is, and not guessed:
+        points are as exact as the poses that they are had from
         """
         if tracked.temporary is None:
             tracked.temporary = _none(tracked.seen)
         before = self.created
         self._from_depth(tracked)
-        for past in self._partners(tracked):
-            if self._matched(tracked) >= self.config.enough or len(self) >= self.config.most:
+        for past in self._partners(tracked) if measured else ():
+            known = np.count_nonzero((tracked.point >= 0) | self.measured(tracked.temporary))
+            if known >= self.config.enough or len(self) >= self.config.most:
                 break
             self._triangulate(tracked, past)
         self._suppose(tracked, distance_m)

@@ -34,6 +34,8 @@ class Tracked:
     point : (N,) map point of every feature, -1 = none; inliers only
     reference : the keyframe that sees most of those points; noise : sigma of its corners over a sharp frame's
     temporary : (N,) temporary point of every feature, -1 = none; None where there are no such points
+    right_in_map, right_in_all, measured : how many of the map's points agree beyond chance, of both kinds, and of both
+        kinds those whose distance is known; -1 = not asked
     """
 
     t_ns: int
@@ -46,6 +48,9 @@ class Tracked:
     why_lost: str = ""
     T_reference_body: SE3 = field(default_factory=SE3.identity)
     temporary: Ints | None = None
+    right_in_map: int = -1
+    right_in_all: int = -1
+    measured: int = -1
 
     @property
     def n_inliers(self) -> int:

@@ -31,6 +31,7 @@ SHARP, MAX_NOISE = 1.25, 4.0  # a frame's noise over a sharp one's: below, it co
 INLIERS = 0.95  # of right matches, which pass their test
 CHANCE_SIGMA = 3.0  # of the binomial distribution of those that agree by chance: so many are put down to it
 UNROLLINGS, SETTLED_PX = 3, 1.0  # of a rolling shutter: at most so many, until rows are moved by less than that
+NARROW, WIDE = 2.5, 4.0  # windows around points seen from where they were mapped, and from elsewhere
 RADIAN_M = 3.0  # a turn by a radian takes as much out of view as this many metres
 MAJORITY = 0.5  # of the matches: fewer that agree on a pose, and another may have more
 
@@ -132,7 +133,7 @@ class Tracker:
         """
         new = ~np.isin(sight.point, point[point >= 0])
         octave = sight.octave[new]
-        radius = np.where(sight.cosine[new] > 0.998, 2.5, 4.0) * search * self.orb.scale(octave)
+        radius = np.where(sight.cosine[new] > 0.998, NARROW, WIDE) * search * self.orb.scale(octave)
         match = index.search(sight.px[new], radius, (octave - 1, octave + 1), desc[new], free=free, ratio=0.8)
         point = point.copy()
         point[match[match >= 0]] = sight.point[new][match >= 0]
