@@ -47,27 +47,34 @@ class LightWatch:
     def __init__(self, lights: dict[str, Light]) -> None:
         self._lights = lights
         self._rays: dict[str, deque[tuple[int, Array, Array]]] = {}
+        self._suspects: set[str] = set()
         self.misplaced: dict[str, Misplaced] = {}
 
     def forget(self) -> None:
         """The poses so far were in another frame."""
         self._rays.clear()
+        self._suspects.clear()
         self.misplaced.clear()
 
-    def see(self, t_ns: int, name: str, T_world_cam: SE3, ray_cam: Array) -> Misplaced | None:
-        """One sighting; the light, once, when it proves to hang elsewhere."""
+    def see(self, t_ns: int, name: str, T_world_cam: SE3, ray_cam: Array) -> list[Misplaced]:
+        """One sighting; the lights that prove by it to hang elsewhere, each told once: this one, or one seen lately."""
         rays = self._rays.setdefault(name, deque(maxlen=KEPT))
         direction = T_world_cam.R @ ray_cam
         rays.append((t_ns, T_world_cam.t, direction / np.linalg.norm(direction)))
-        if name in self.misplaced:
-            return None
-        xyz = self._place(name)
-        if xyz is None or self._across_m(name, xyz) < OFF_M or not self._convicted(name, xyz):
-            return None
-        others = [o for o in self._lights.values() if o.id != name and np.linalg.norm(o.xyz - xyz) < OFF_M]
-        found = Misplaced(self._lights[name], xyz, others[0].id if others else "")
-        self.misplaced[name] = found
+        self._suspects.add(name)
+        found = []
+        for suspect in sorted(self._suspects - self.misplaced.keys()):
+            xyz = self._place(suspect)
+            if xyz is None or self._across_m(suspect, xyz) < OFF_M or self._ago_s(suspect, t_ns) > RECENT_S:
+                self._suspects.discard(suspect)
+            elif self._convicted(suspect, xyz):
+                others = [o for o in self._lights.values() if o.id != suspect and np.linalg.norm(o.xyz - xyz) < OFF_M]
+                self.misplaced[suspect] = Misplaced(self._lights[suspect], xyz, others[0].id if others else "")
+                found.append(self.misplaced[suspect])
         return found
+
+    def _ago_s(self, name: str, t_ns: int) -> float:
+        return abs(t_ns - self._rays[name][-1][0]) * 1e-9
 
     def _place(self, name: str, since_ns: int | None = None) -> Array | None:
         """(3,) where a light's rays meet; None where they are few, nearly parallel, or do not meet."""
@@ -99,7 +106,7 @@ class LightWatch:
         since_ns, now_ns = self._rays[name][0][0], self._rays[name][-1][0]
         witnesses = beside = 0
         for other in self._rays:
-            if other == name or (now_ns - self._rays[other][-1][0]) * 1e-9 > RECENT_S:
+            if other == name or self._ago_s(other, now_ns) > RECENT_S:
                 continue
             survey, place = self._lights[other].xyz, self._place(other)
             witnesses += place is not None and bool(np.linalg.norm(place - survey) < NEAR_M)

@@ -9,7 +9,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
 
 NS = 1e-9
-KEPT = 64  # frames
+KEPT = 256  # frames
 GAP_S = 0.25  # between two frames that are interpolated
 
 

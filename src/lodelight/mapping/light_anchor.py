@@ -27,13 +27,13 @@ from lodelight.messages import Doubt, LightFix
 from lodelight.types import Array
 
 NS = 1e-9
-WAITING = 64  # fixes that wait for the frame behind them
+WAITING = 64  # fixes that wait for the frame behind them, or for the map to be laid down
 CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
-DOUBTED_S = 0.2
+HELD_S = 0.2
 MOTION_SHARE = 0.5  # of the gate's thresholds: fixes' motion within a second is better known than their place
 WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
-NOT_YET = "the map's place in the world rests on less than ten fixes"
+NOT_YET = "the map's place in the world rests on less than ten fixes of three lights"
 
 
 class LightAnchor:
@@ -51,8 +51,9 @@ class LightAnchor:
         map.anchoring = Anchoring(self.spec, self._lights)
         self._buffer = FixBuffer()
         self._waiting: deque[LightFix] = deque(maxlen=WAITING)
+        self._unread: deque[LightFix] = deque(maxlen=WAITING)
         self._path = BodyPath(map)
-        self._placement = Placement(self._path)
+        self._placement = Placement(self._path, len(self._lights))
         self._ties = LightTies(map, self._path, lights, self._lights, emit)
         self._clock = ClockCheck()
         self._continuity = Continuity()
@@ -63,7 +64,7 @@ class LightAnchor:
         self._pending: SE3 | None = None
         self._asked_ns: int | None = None
         self._tied_ns: int | None = None  # the last keyframe that a pose by the lights holds
-        self._doubted_ns = -(10**18)
+        self._doubted_ns = self._held_ns = -(10**18)
 
     @property
     def aligned(self) -> bool:
@@ -102,10 +103,12 @@ class LightAnchor:
             fix = self._waiting.popleft()
             node = self._path.at(fix.t_ns)
             usable = not any(name in self._ties.watch.misplaced for name in fix.lights)
-            if node is not None and fix.T_world_body is not None and usable and not self._doubted_at(fix.t_ns):
+            if node is not None and fix.T_world_body is not None and usable and not self._held_at(fix.t_ns):
                 self._meet(fix, fix.T_world_body, node)
-            if self.aligned and not self._off_clock and self._pending is None:
-                for sighting in fix.seen:
+            self._unread.append(fix)
+        if self.aligned and not self._off_clock and self._pending is None:
+            while self._unread:  # also those from before the map was laid down
+                for sighting in self._unread.popleft().seen:
                     self._ties.see(sighting)
 
     def take_move(self) -> SE3 | None:
@@ -154,6 +157,8 @@ class LightAnchor:
         if any(name in self._ties.watch.misplaced for name in light.lights):
             return None
         expected = self._continuity.expected(t_ns, light.T_world_body)
+        if expected is not None and T_world_body is None:
+            self._held_ns = t_ns
         said = Doubt(expected or light.T_world_body, light.covariance, expected is not None)
         if T_world_body is None:
             return said
@@ -165,6 +170,8 @@ class LightAnchor:
             content = config.near(d.angle_deg, d.centre_m) or d.chi2 <= config.chi2
         if content:
             return None
+        if expected is not None:
+            self._held_ns = t_ns
         if t_ns != self._doubted_ns:  # not what was found there, when that is shown as well
             self._doubted_ns = t_ns
             self.emit(t_ns, "light_doubt", angle_deg=d.angle_deg, centre_m=d.centre_m)
@@ -196,9 +203,9 @@ class LightAnchor:
 
     # -- parts --------------------------------------------------------------------------------------------------
 
-    def _doubted_at(self, t_ns: int) -> bool:
+    def _held_at(self, t_ns: int) -> bool:
         """Whether frames about a time may have their pose from the lights: they cannot say whether these are right."""
-        return abs(t_ns - self._doubted_ns) * NS < DOUBTED_S
+        return abs(t_ns - self._held_ns) * NS < HELD_S
 
     def _meet(self, fix: LightFix, T_world_body: SE3, node: Node) -> None:
         move = self._placement.meet(fix, T_world_body, node)

@@ -14,6 +14,7 @@ from lodelight.types import Array
 
 PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
+ALIGN_LIGHTS = 3  # that those pairs must have seen: two that were swapped agree with themselves
 CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
 
 
@@ -28,9 +29,13 @@ class Move:
 
 
 class Placement:
-    """Of one map. placed : it has a place in the world, if only by one fix; aligned : for good."""
+    """Of one map, in a building of so many surveyed lights.
 
-    def __init__(self, path: BodyPath) -> None:
+    placed : it has a place in the world, if only by one fix; aligned : for good
+    """
+
+    def __init__(self, path: BodyPath, surveyed: int) -> None:
+        self._fewest = min(ALIGN_LIGHTS, surveyed)
         self._path = path
         self._met: list[tuple[LightFix, SE3, Node]] = []
         self._laid: tuple[int, SE3, Array] | None = None  # when, by which pose of the body, and its covariance
@@ -72,8 +77,11 @@ class Placement:
             if not self.aligned and len(pairs) >= 2 * ALIGN_PAIRS:
                 self.no_fit = f"only {found.count} of {len(pairs)} poses by the lights agree on a place of the map"
             return None
-        again, self.aligned, self.no_fit = self.aligned, True, ""
         used = [met for met, agrees in zip(self._met, found.agrees, strict=True) if agrees]
+        names = {name for fix, _, _ in used for name in fix.lights}
+        if names and len(names) < self._fewest:
+            return None
+        again, self.aligned, self.no_fit = self.aligned, True, ""
         last, T_world_body, _ = used[-1]
         self._laid = last.t_ns, T_world_body, np.mean([fix.covariance for fix, _, _ in used], axis=0)
         return Move(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs), again)
