@@ -193,7 +193,10 @@ def test_one_light_is_not_counted_twice():
 
 
 def test_a_light_that_hangs_elsewhere_is_named_and_the_others_are_not():
-    lights = {f"L{i}": Light(f"L{i}", 2000.0, np.array([1.2 * (i % 3), 1.2 * (i // 3), 2.5])) for i in range(6)}
+    lights = {
+        f"L{i}": Light(f"L{i}", 2000.0 + 200.0 * min(i, 4), np.array([1.2 * (i % 3), 1.2 * (i // 3), 2.5]))
+        for i in range(6)
+    }
     true = {name: light.xyz for name, light in lights.items()}
     true["L1"] = true["L1"] + [0.0, 1.0, 0.0]  # moved
     true["L3"], true["L5"] = true["L5"], true["L3"]  # swapped
@@ -207,6 +210,8 @@ def test_a_light_that_hangs_elsewhere_is_named_and_the_others_are_not():
     assert found["L1"].off_m == pytest.approx(1.0, abs=0.05)
     assert (found["L3"].other, found["L5"].other) == ("L5", "L3")
     assert "where L5 should hang" in found["L3"].why
+    assert (found["L5"].alike, found["L3"].alike) == (("L4",), ())
+    assert "L5 (or L4, of its code)" in found["L5"].why
 
 
 def test_a_map_that_has_drifted_names_no_light():

@@ -24,11 +24,15 @@ SPREAD_M = 0.15  # rms distance of the place from its rays
 
 @dataclass(frozen=True, eq=False)
 class Misplaced:
-    """A light that hangs elsewhere. xyz (3,) m, world: where; other : the light that is surveyed there, or \"\"."""
+    """A light that hangs elsewhere. xyz (3,) m, world: where; other : the light that is surveyed there, or \"\".
+
+    alike : those that have its code as well, one of which it may be
+    """
 
     light: Light
     xyz: Array
     other: str
+    alike: tuple[str, ...] = ()
 
     @property
     def off_m(self) -> float:
@@ -38,7 +42,8 @@ class Misplaced:
     def why(self) -> str:
         where = f"where {self.other} should hang" if self.other else "not where it was surveyed"
         at = ", ".join(f"{v:.2f}" for v in self.xyz)
-        return f"light {self.light.id} hangs at {at}, {self.off_m:.2f} m from its survey, {where}"
+        alike = f" (or {', '.join(self.alike)}, of its code)" if self.alike else ""
+        return f"light {self.light.id}{alike} hangs at {at}, {self.off_m:.2f} m from its survey, {where}"
 
 
 class LightWatch:
@@ -68,10 +73,15 @@ class LightWatch:
             if xyz is None or self._across_m(suspect, xyz) < OFF_M or self._ago_s(suspect, t_ns) > RECENT_S:
                 self._suspects.discard(suspect)
             elif self._convicted(suspect, xyz):
-                others = [o for o in self._lights.values() if o.id != suspect and np.linalg.norm(o.xyz - xyz) < OFF_M]
-                self.misplaced[suspect] = Misplaced(self._lights[suspect], xyz, others[0].id if others else "")
+                self.misplaced[suspect] = self._named(self._lights[suspect], xyz)
                 found.append(self.misplaced[suspect])
         return found
+
+    def _named(self, light: Light, xyz: Array) -> Misplaced:
+        others = [o for o in self._lights.values() if o.id != light.id]
+        there = [o.id for o in others if np.linalg.norm(o.xyz - xyz) < OFF_M]
+        alike = tuple(o.id for o in others if (o.frequency_hz, o.word) == (light.frequency_hz, light.word))
+        return Misplaced(light, xyz, there[0] if there else "", alike)
 
     def _ago_s(self, name: str, t_ns: int) -> float:
         return abs(t_ns - self._rays[name][-1][0]) * 1e-9

@@ -89,7 +89,8 @@ class LightTies:
         px = centre_px(sighting.centre_px, T_world_cam, self._spec.camera, light)
         ray, _ = self._spec.camera.unproject(px[None])
         for bad in self.watch.see(sighting.t_ns, light.id, T_world_cam, ray[0]):
-            self._emit(sighting.t_ns, "light_misplaced", light=bad.light.id, off_m=bad.off_m, why=bad.why)
+            told = {"light": bad.light.id, "alike": list(bad.alike), "off_m": bad.off_m, "why": bad.why}
+            self._emit(sighting.t_ns, "light_misplaced", **told)
             self._map.anchoring.forget_light(bad.light.id)
         if self._config.use == "tight" and light.id not in self.watch.misplaced:
             seen = _Seen(light.id, node, px, max(sighting.sigma_px, self._config.sigma_px))
