@@ -17,9 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lodelight.anchors import Anchors
 from lodelight.geometry.se3 import SE3
+from lodelight.io.anchors_toml import write_anchors
 from lodelight.io.rig_toml import write_rig
-from lodelight.mapping.store import check_map, save_map
+from lodelight.mapping.store import check_map, load_map, save_map
 from lodelight.rig import ImuSpec
 from lodelight.ros import messages
 from lodelight.ros.core import NodeConfig, NodeCore
@@ -27,7 +29,7 @@ from lodelight.ros.frames import OdomFrame
 from lodelight.ros.partners import Partners
 from lodelight.ros.wiring import PUBLISHED, Parameters
 from lodelight.slam import Slam
-from tagged_wall import RIG, STEP_NS, frame, poses, wall_picture, write_walk
+from tagged_wall import RIG, STEP_NS, T_WORLD_WALL, TAGS, frame, poses, surveyed, wall_picture, write_walk
 
 DEBIAN = "/usr/lib/python3/dist-packages"
 N_FRAMES = 14
@@ -140,6 +142,24 @@ def test_a_node_that_localizes_finds_itself_in_a_saved_map_and_leaves_it_alone(f
         off = path.pose(int(np.flatnonzero(path.t_ns == t_ns)[0])).inverse() @ T
         assert np.linalg.norm(off.t) < 0.01
     assert (tmp_path / "map.lode").read_bytes() == before
+
+
+def test_a_map_that_tags_tie_to_the_world_is_saved_in_the_world(frames, tmp_path):
+    write_anchors(tmp_path / "anchors.toml", Anchors(tuple(map(surveyed, TAGS))))
+    config = NodeConfig(map_file=str(tmp_path / "map.lode"), anchors=str(tmp_path / "anchors.toml"))
+    core = NodeCore(RIG, config, lambda out: None)
+    for f in frames:
+        core.image("cam0", f.t_ns, f.images[0])
+        core.image("depth", f.t_ns, f.depth)
+        while core._came_s:
+            time.sleep(0.005)
+    for _ in range(2):  # saving moves nothing that is at work
+        core.save_map()
+    core.close()
+    assert core.system.tags.aligned
+    saved, truth = load_map(tmp_path / "map.lode"), list(poses(40))
+    for t_ns, p in zip(saved.keyframes.t_ns.tolist(), saved.keyframes.p, strict=True):
+        assert np.linalg.norm(p - (T_WORLD_WALL @ truth[t_ns // STEP_NS - 1]).t) < 0.03
 
 
 def test_samples_and_fixes_reach_the_system(tmp_path):
