@@ -1,0 +1,123 @@
+"""What the inertial system's noise rests on: `python benchmarks/inertial.py imu|starts|tracks FOLDER`.
+
+imu FOLDER : an EuRoC recording with groundtruth/*.csv; its IMU against its truth, as a density by averaging time
+starts FOLDER : of the same; starts in flight along it, with its IMU and simulated tracks: how many are wrong
+tracks FOLDER : a rendered recording (`lodelight sim`); how far tracks leave their points, by frames in between
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from lodelight.features.klt import KltTracker
+from lodelight.imu.preintegration import preintegrate
+from lodelight.imu.samples import ImuSamples
+from lodelight.io.listing import ImuTable
+from lodelight.io.sources import open_source
+from lodelight.io.trajectories import read_trajectory
+from lodelight.messages import Frame, Imu
+from lodelight.odometry.inertial import InertialOdometry
+from lodelight.rig import ImuSpec
+from lodelight.sim import rigs
+from lodelight.sim.motion import GRAVITY, Motion
+from lodelight.sim.scenarios import Request, prepare
+from lodelight.sim.space import Space
+from odometry_scenes import Points
+
+STEP_S = 0.05
+
+
+def flown(folder: Path) -> tuple[Motion, ImuTable]:
+    truth = next(iter((folder / "groundtruth").glob("*.csv")))
+    return Motion.fit(read_trajectory(truth)), ImuTable.read(folder / "mav0" / "imu0" / "data.csv")
+
+
+def imu(folder: Path) -> None:
+    motion, table = flown(folder)
+    second = {name: np.diff(getattr(table, name), 2, axis=0) for name in ("gyro", "accel")}
+    period = float(np.median(np.diff(table.t_ns))) * 1e-9
+    for name, d in second.items():
+        print(f"{name}: samples show a density of {np.sqrt((d**2).mean() / 6.0 * period):.5f}")
+    t_ns = motion.start_ns + np.arange(int(12e9), int((motion.duration_s - 8.0) * 1e9), round(STEP_S * 1e9))
+    states, none = motion.at_ns(t_ns), np.zeros(3)
+    turn, push = [], []
+    for i in range(len(t_ns) - 1):
+        lo, hi = np.searchsorted(table.t_ns, t_ns[i], "right") - 1, np.searchsorted(table.t_ns, t_ns[i + 1]) + 1
+        samples = ImuSamples(table.t_ns[lo:hi], table.gyro[lo:hi], table.accel[lo:hi])
+        moved = preintegrate(samples.between(int(t_ns[i]), int(t_ns[i + 1])), none, none, ImuSpec())
+        R = states.R_world_body[i]
+        turn.append(Rotation.from_matrix(moved.dR.T @ R.T @ states.R_world_body[i + 1]).as_rotvec() / STEP_S)
+        dv = states.v_world[i + 1] - states.v_world[i] - GRAVITY * STEP_S
+        push.append((R.T @ dv - moved.dv) / STEP_S)
+    for name, rate in (("gyro, rad/s", np.array(turn)), ("accel, m/s^2", np.array(push))):
+        for n in (4, 8, 16, 32, 64, 128):
+            mean = rate[: len(rate) // n * n].reshape(-1, n, 3).mean(axis=1)
+            allan = np.sqrt(0.5 * (np.diff(mean, axis=0) ** 2).mean())
+            print(f"{name}, {n * STEP_S:.1f} s: Allan deviation {allan:.5f}, density {allan * np.sqrt(n * STEP_S):.5f}")
+
+
+def starts(folder: Path, every_s: float = 4.1) -> None:
+    motion, table = flown(folder)
+    wrong, took = 0, []
+    for begin in np.arange(7.0, motion.duration_s - 7.0, every_s):
+        t0 = motion.start_ns + int(begin * 1e9)
+        odometry = InertialOdometry(rigs.euroc(False), "mono")
+        odometry.tracker = Points(motion, odometry.rig, 0, 0.07)  # type: ignore[assignment]
+        near = np.flatnonzero((table.t_ns >= t0 - 20_000_000) & (table.t_ns < t0 + 4_000_000_000))
+        messages: list[Imu | Frame] = [Imu(int(table.t_ns[i]), table.gyro[i], table.accel[i]) for i in near]
+        messages += [Frame(t0 + k * 50_000_000, ()) for k in range(78)]
+        for message in sorted(messages, key=lambda m: m.t_ns):
+            step = odometry.feed_frame(message) if isinstance(message, Frame) else odometry.feed_imu(message)
+            if step is not None and step.status == "tracking":
+                true = motion.at_ns(np.array([step.frame.t_ns]))
+                body = step.state.T_world_body.R.T @ step.state.v_world
+                off = float(np.linalg.norm(body - true.R_world_body[0].T @ true.v_world[0]))
+                took.append((step.frame.t_ns - t0) * 1e-9)
+                wrong += off > 0.1
+                break
+    print(f"{len(took)} starts, {wrong} with a velocity off by more than 0.1 m/s; within {max(took):.2f} s")
+
+
+def tracks(folder: Path, start_s: float = 12.0, end_s: float = 24.0) -> None:
+    asked = json.loads((folder / "simulation.json").read_text())
+    names = {field.name for field in fields(Request)}
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in asked.items() if k in names}
+    simulation = prepare(Request(**values), 1, lit=False)
+    space, recording = Space(simulation.building), open_source(folder)
+    spec, errors, points = recording.rig.cameras[0], defaultdict(list), {}
+    tracker, last = KltTracker(recording.rig, "mono"), None
+    for message in recording.messages("mono", start_s, end_s):
+        if not isinstance(message, Frame):
+            continue
+        T = simulation.motion.at_ns(np.array([message.t_ns])).poses()[0] @ spec.T_body_cam
+        seen = tracker.process(message, None if last is None else T.R.T @ last.R, 2e-3)
+        last = T
+        for number, px, ray in zip(seen.id.tolist(), seen.px, seen.ray, strict=True):
+            if number not in points:
+                points[number] = T.t + space._cast(T.t, T.R @ ray, 50.0)[0] * (T.R @ ray)
+            errors[number].append(px - spec.camera.project(T.inverse() @ points[number][None])[0][0])
+    for gap in (1, 2, 4, 8, 16, 32):
+        change = np.vstack([np.array(e[gap:]) - np.array(e[:-gap]) for e in errors.values() if len(e) > gap])
+        print(f"{gap} frames: {1.4826 * np.median(np.abs(change)):.3f} px an axis (1.48 times the median)")
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("what", choices=("imu", "starts", "tracks"))
+    arguments.add_argument("folder", type=Path)
+    options = arguments.parse_args()
+    {"imu": imu, "starts": starts, "tracks": tracks}[options.what](options.folder)
