@@ -16,6 +16,7 @@ from lodelight.estimation.window_frames import prepared
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp
 from lodelight.imu.preintegration import NavState, preintegrate
+from lodelight.mapping.inertial_adjust import weighed
 
 STRETCH, TILT = 1.05, 0.03  # what the start is off by: a monocular scale, and radians about x
 
@@ -133,3 +134,13 @@ def test_a_pose_that_is_held_stays_and_others_follow_the_imu(walk):
     result, _ = inertial_bundle_adjust(blind, some)
     assert np.array_equal(result.p[0], truth[0].T_world_body.t)
     assert np.linalg.norm(result.p[2] - truth[2].T_world_body.t) < 0.1
+
+
+def test_corners_that_fit_better_than_assumed_count_more(walk):
+    problem, chain, _ = walk
+    cautious = replace(problem, sigma_px=2.0 * problem.sigma_px)
+    result, rest = inertial_bundle_adjust(cautious, chain, 20)
+    again = weighed(cautious, result)
+    assert np.median(again.sigma_px / problem.sigma_px) == pytest.approx(1.0, abs=0.1)
+    result, _ = inertial_bundle_adjust(again, replace(chain, rest=rest), 5)
+    assert np.median(weighed(again, result).sigma_px / again.sigma_px) == pytest.approx(1.0, abs=0.15)

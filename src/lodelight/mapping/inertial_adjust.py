@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lodelight.estimation.bundle_problem import BundleProblem
+from lodelight.estimation.bundle_problem import BundleProblem, BundleResult
 from lodelight.estimation.factors.pose_prior import PosePrior
 from lodelight.estimation.inertial_bundle import ImuChain, inertial_bundle_adjust
 from lodelight.features.orb import OrbConfig
@@ -17,6 +17,8 @@ from lodelight.mapping.map import Map
 from lodelight.mapping.tag_corners import with_tag_corners
 from lodelight.types import Array, Ints
 
+WEIGHINGS = 2  # times that the corners' noise is found from what is left of them
+WEIGHED = (0.4, 3.0)  # by no more than that at a time
 FREE_TILT, HELD_YAW, HELD_M = 0.1, 1e-4, 1e-4  # rad, rad, m: of the root, whose vertical the IMU knows better
 
 
@@ -36,13 +38,31 @@ def adjust_with_imu(
         if chain is None:
             return False
         tied = upright_free(with_tag_corners(map, problem if metric else without_depth(problem), keyframes, window))
-    result, _ = inertial_bundle_adjust(tied, chain, iterations)
+    result, rest = inertial_bundle_adjust(tied, chain, iterations)
+    for _ in range(WEIGHINGS):
+        tied = weighed(tied, result)
+        result, rest = inertial_bundle_adjust(tied, replace(chain, rest=rest), iterations)
     with map.lock:
         commit_bundle(map, result.R, result.p, result.xyz[: len(points)], tied.fixed, keyframes, points)
         still = map.features.point[rows] == points[problem.point]
         map.unlink(rows[~result.inliers[: len(rows)] & still])
         map.refresh_points(points[map.points.alive[points]], orb.scale_factor, orb.n_levels)
     return True
+
+
+def weighed(problem: BundleProblem, result: BundleResult) -> BundleProblem:
+    """From the result on, with corners as noisy as they have shown to be.
+
+    What is assumed of them is cautious; beside an IMU caution has a price: the less images count, the more of the
+    IMU's noise becomes scale.
+    """
+    used = result.inliers
+    unknowns = 3 * len(np.unique(problem.point[used])) + 6 * len(problem.R)
+    rows = 2 * int(used.sum()) + int((problem.inv_depth[used] > 0.0).sum())
+    if rows < 2 * unknowns:
+        return problem
+    share = float(np.clip(np.sqrt(result.chi2[used].sum() / (rows - unknowns)), *WEIGHED))
+    return replace(problem, R=result.R, p=result.p, xyz=result.xyz, sigma_px=share * np.asarray(problem.sigma_px))
 
 
 def upright_free(problem: BundleProblem) -> BundleProblem:
