@@ -119,7 +119,7 @@ def run(source: Path, mode: str, settings: list[str], end_s: float, fault: str, 
         flush=True,
     )
     for t, kind, f in events:
-        if kind in ("world", "gate_blame", "light_misplaced"):
+        if kind in ("world", "gate_blame", "light_misplaced", "light_clock"):
             print(f"    {(t - int(truth.t_ns[0])) * 1e-9:.2f} s {kind}: {f['why']}", flush=True)
 
 
