@@ -148,6 +148,18 @@ class TemporaryPoints:
         )
         return out.astype(np.int32)
 
+    def uncertainty(self, temporary: Ints, centre: Array) -> Array:
+        """(K,) rad: how far from where points should appear to a camera at centre they may, for want of a distance."""
+        moved = np.linalg.norm(self.table.centre[temporary] - centre, axis=1)
+        out: Array = moved * self.table.sigma_inv_distance[temporary]
+        return out
+
+    def measured(self, temporary: AnyArray) -> Bools:
+        """(N,) which of them name a point whose distance is measured, and not supposed."""
+        known = self.table.sigma_inv_distance == 0.0
+        out: Bools = (temporary >= 0) & (known[np.maximum(temporary, 0)] if len(known) else False)
+        return out
+
     # -- how they are made --------------------------------------------------------------------------------------
 
     def grow(self, tracked: Tracked, distance_m: Array, measured: bool) -> int:
@@ -167,18 +179,6 @@ class TemporaryPoints:
             self._triangulate(tracked, past)
         self._suppose(tracked, distance_m)
         return self.created - before
-
-    def uncertainty(self, temporary: Ints, centre: Array) -> Array:
-        """(K,) rad: how far from where points should appear to a camera at centre they may, for want of a distance."""
-        moved = np.linalg.norm(self.table.centre[temporary] - centre, axis=1)
-        out: Array = moved * self.table.sigma_inv_distance[temporary]
-        return out
-
-    def measured(self, temporary: AnyArray) -> Bools:
-        """(N,) which of them name a point whose distance is measured, and not supposed."""
-        known = self.table.sigma_inv_distance == 0.0
-        out: Bools = (temporary >= 0) & (known[np.maximum(temporary, 0)] if len(known) else False)
-        return out
 
     def _matched(self, tracked: Tracked) -> int:
         return int(np.count_nonzero(_taken(tracked.point, tracked.temporary)))
