@@ -42,7 +42,7 @@ class Located:
     """One frame: its estimate, and where it hangs: reference is a keyframe of the map, -1 where there is none.
 
     inserted : the keyframe that this frame became, -1 where it did not; why : the reason
-    tags : that were seen in it
+    tags : that were seen in it; before : of a keyframe, its reference until then and where it was beside that
     """
 
     frame: Frame
@@ -52,6 +52,7 @@ class Located:
     inserted: int = -1
     why: str = ""
     tags: tuple[TagSighting, ...] = ()
+    before: tuple[int, SE3] | None = None
 
 
 class InertialFront:
@@ -111,13 +112,16 @@ class InertialFront:
         self._window = self.odometry.window
         if step.status not in ("tracking", "degraded"):
             return self._nowhere(step, clock)
-        inserted = -1
+        inserted, before = -1, None
         with self.map.lock:
             self._settle_departed()
             if step.keyframe:
                 if self._known and self._reference < 0 and not self._found(step):
                     return self._nowhere(step, clock, "not found in the map yet")
+                if self._reference >= 0 and not step.restarted:
+                    before = self._reference, self._T_map_reference.inverse() @ step.state.T_world_body
                 inserted = self._insert(step)
+                before = before if inserted >= 0 else None
             elif self._reference < 0:
                 return self._nowhere(step, clock, "not found in the map yet")
             T_world_map = self.T_world_map
@@ -131,7 +135,7 @@ class InertialFront:
             t_ns, step.status, T_world_body, turn @ covariance @ turn.T, step.why, step.inliers, details
         )  # fmt: skip
         return Located(
-            step.frame, estimate, self._reference, T_reference_body, inserted, step.keyframe, step.tags
+            step.frame, estimate, self._reference, T_reference_body, inserted, step.keyframe, step.tags, before
         )  # fmt: skip
 
     def _nowhere(self, step: OdometryStep, clock: Stopwatch, why: str = "") -> Located:

@@ -30,6 +30,7 @@ from lodelight.mapping.light_ties import LightsConfig
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig, adjust
 from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map
+from lodelight.mapping.path import PathNode, laid_down
 from lodelight.mapping.places import Places
 from lodelight.mapping.tags import MapTags, MapTagsConfig
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
@@ -64,15 +65,6 @@ class SlamConfig:
     lights: LightsConfig = field(default_factory=LightsConfig)
     tags: MapTagsConfig = field(default_factory=MapTagsConfig)
     inertial: OdometryConfig = field(default_factory=OdometryConfig)
-
-
-@dataclass(frozen=True, eq=False)
-class PathNode:
-    """A localized frame, held to the keyframe that was its reference, so that it moves as the map is corrected."""
-
-    t_ns: int
-    reference: int
-    T_reference_body: SE3
 
 
 class Slam:
@@ -209,7 +201,7 @@ class Slam:
         """T_world_body of all localized frames, as the map stands now."""
         return Trajectory.from_poses(
             [node.t_ns for node in self.path],
-            [self.tags.world(self.map.pose(node.reference) @ node.T_reference_body) for node in self.path],
+            [self.tags.world(T) for T in laid_down(self.path, self.map.pose)],
         )
 
     def cloud(self) -> Array:
@@ -266,7 +258,7 @@ class Slam:
         """What the inertial half made of a frame: into the path, and its keyframe to mapping."""
         estimate = located.estimate
         if located.reference >= 0 and estimate.localized:
-            self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body))
+            self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body, located.before))
         if located.inserted >= 0:
             self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.why, weight=1.0)
             with self.map.lock:
