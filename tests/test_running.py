@@ -48,7 +48,7 @@ def frames(n, period_ms):
 
 def test_pacing_drops_the_oldest_waiting_frames_of_a_slow_consumer_and_none_of_a_fast_one():
     dropped = []
-    assert len(list(Paced(frames(20, 5), dropped.append))) == 20
+    assert len(list(Paced(frames(20, 50), dropped.append))) == 20  # a machine may be busy for some of these 50 ms
     assert dropped == []
     got = []
     for frame in Paced(frames(20, 5), dropped.append):
