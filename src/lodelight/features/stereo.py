@@ -235,7 +235,10 @@ def _slide(
         bend = before - 2.0 * here + after
         if bend <= 0.0:
             continue
-        shift_px[i] = scale * (lowest - SLIDE + 0.5 * (before - after) / bend)
+        shift = lowest - SLIDE + 0.5 * (before - after) / bend
+        if abs(shift) > OFF_CURVE_PX:  # along the curve a corner is as noisy as across it: the patch is another one's
+            continue
+        shift_px[i] = scale * shift
         difference[i] = math.sqrt(here) / side
 
 
