@@ -224,7 +224,7 @@ def test_stereo_depth_is_exact_to_a_fifth_of_a_pixel_for_any_lens_and_turn(model
     got = matcher.measure(extractor.extract(pyramid), pyramid, other)
     measured = got.inv_depth > 0
     disparity_error = (got.inv_depth[measured] - 1 / z) * 500 * 0.12 / 1.2 ** got.octave[measured]
-    assert measured.sum() > 400
+    assert measured.sum() > len(got) / 3
     assert np.median(np.abs(disparity_error)) < 0.2
     assert np.mean(np.abs(disparity_error) < 1.0) > 0.95
     pulls = (got.inv_depth[measured] - 1 / z) / got.sigma_inv_depth[measured]

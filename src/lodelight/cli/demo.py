@@ -21,7 +21,7 @@ def demo(
     out: Path = typer.Option(Path("lodelight-demo"), help="Folder for the recordings and the results; created."),
     seed: int = typer.Option(0, help="Another seed, other buildings."),
 ) -> None:
-    """Simulate two small buildings, run the three systems in them, say how exact each was."""
+    """Simulate two buildings, run the three systems in them, say how exact each was."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 

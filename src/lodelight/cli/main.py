@@ -20,7 +20,7 @@ from lodelight.errors import LodelightError, RunError
 
 # name: (module, the first line of its help)
 COMMANDS = {
-    "demo": ("lodelight.cli.demo", "Simulate two small buildings, run the three systems in them, say how exact each was."),
+    "demo": ("lodelight.cli.demo", "Simulate two buildings, run the three systems in them, say how exact each was."),
     "sim": ("lodelight.cli.sim", "Render a named building as a recording with ground truth, rig and anchors."),
     "run": ("lodelight.cli.run", "SLAM over a recording: trajectory, map and report."),
     "localize": ("lodelight.cli.localize", "Find and follow a camera in a saved map, which is never changed."),
