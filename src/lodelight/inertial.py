@@ -200,7 +200,7 @@ class InertialFront:
         T_world_map = self.T_world_map
         for gone in window.departed():
             keyframe = self._in_window.pop(gone.t_ns, -1)
-            self.flown.add(keyframe, gone.state, gone.imu, self.odometry.spec)
+            self.flown.add(keyframe, gone.state, gone.imu, self.odometry.spec, gone.still)
             if keyframe >= 0 and keyframe != self._reference and self.map.keyframes.alive[keyframe]:
                 self.map.set_pose(keyframe, T_world_map @ gone.state.T_world_body)
 
@@ -214,11 +214,12 @@ class InertialFront:
     def _leave(self, window: Window) -> None:
         """A window that ends: its keyframes have flown."""
         for gone in window.departed():
-            self.flown.add(self._in_window.pop(gone.t_ns, -1), gone.state, gone.imu, self.odometry.spec)
+            self.flown.add(self._in_window.pop(gone.t_ns, -1), gone.state, gone.imu, self.odometry.spec, gone.still)
         frames = [frame for frame in window.frames if frame.keyframe]
         for frame, after in zip(frames, [*frames[1:], None], strict=True):
             imu = after.imu.samples if after is not None and after.imu is not None else None
-            self.flown.add(self._in_window.pop(frame.t_ns, -1), frame.state, imu, self.odometry.spec)
+            keyframe, still = self._in_window.pop(frame.t_ns, -1), frame.still_sigma > 0.0
+            self.flown.add(keyframe, frame.state, imu, self.odometry.spec, still)
 
 
 def level(T: SE3, T_inner: SE3) -> SE3:

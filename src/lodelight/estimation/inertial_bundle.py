@@ -8,17 +8,18 @@ stays linearized where it was wrong. Derivation: docs/derivations-inertial.md. S
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from lodelight.compiled import kernel
 from lodelight.estimation.bundle import Adjustment, Linear, State
 from lodelight.estimation.bundle_problem import BundleProblem, BundleResult, as_f64
-from lodelight.estimation.factors.inertial import inertial_jacobian, inertial_residual
+from lodelight.estimation.factors.inertial import DR, MEASUREMENT, inertial_jacobian, inertial_residual
 from lodelight.types import Array, Bools, Ints
 
 SIGMA_BIAS_GYRO, SIGMA_BIAS_ACCEL = 0.1, 0.2  # rad/s, m/s^2: of a chain's first biases, about zero
+STILL_M_S, STILL_M = 0.01, 0.001  # at a standstill, as in the window
 REST = 9  # velocity, gyroscope's bias, accelerometer's bias
 
 
@@ -28,6 +29,7 @@ class ImuChain:
 
     before, after (L,) rows of the problem; measured (L, 76), whiten (L, 15, 15) as of `window_frames.prepared`
     first (C,) : rows at which a chain begins; rest (K, 9) : where velocities (world) and biases start from
+    still (S,) : rows at a standstill: their velocity is zero
     """
 
     before: Ints
@@ -36,6 +38,7 @@ class ImuChain:
     whiten: Array
     first: Ints
     rest: Array
+    still: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
 def inertial_bundle_adjust(problem: BundleProblem, chain: ImuChain, iterations: int = 15) -> tuple[BundleResult, Array]:
@@ -47,6 +50,14 @@ def inertial_bundle_adjust(problem: BundleProblem, chain: ImuChain, iterations: 
     rest = adjustment.state.rest
     assert rest is not None
     return adjustment.result(()), rest
+
+
+def standing() -> tuple[Array, Array]:
+    """measured (76,), whiten (15, 15) of two keyframes of one standstill: the second is where the first was."""
+    measured, whiten = np.zeros(MEASUREMENT), np.zeros((15, 15))
+    measured[DR : DR + 9] = np.eye(3).ravel()
+    whiten[range(3, 6), range(3, 6)] = 1.0 / STILL_M
+    return measured, whiten
 
 
 @dataclass
@@ -94,6 +105,9 @@ class InertialAdjustment(Adjustment):
         bias = at.rest[c.first, 3:] * self._first_information
         out.chain_g[c.first, 3:] += bias
         extra += float((bias * at.rest[c.first, 3:]).sum())
+        velocity = at.rest[c.still, :3] / STILL_M_S**2
+        out.chain_g[c.still, :3] += velocity
+        extra += float((velocity * at.rest[c.still, :3]).sum())
         out.cost += extra
         return comparable + extra
 
@@ -116,6 +130,8 @@ class InertialAdjustment(Adjustment):
         for k in c.first:
             self.S[self.plan.slot[place[k, 1], place[k, 1]], range(3, 6), range(3, 6)] += info[:3]
             self.S[self.plan.slot[place[k, 2], place[k, 2]], range(3), range(3)] += info[3:]
+        for k in c.still:
+            self.S[self.plan.slot[place[k, 1], place[k, 1]], range(3), range(3)] += STILL_M_S**-2.0
         return self.plan.factor(self.S)
 
     def _step(self, damping: float) -> float | None:

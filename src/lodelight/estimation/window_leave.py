@@ -38,7 +38,8 @@ def marginalize_oldest(window: Window) -> Departed:
     problem, _ = build(window, leaving=Leaving(rows, goes & _sure(window, s.track)))
     problem.linearize(problem.state, problem.linear)
     oldest = frames[0]
-    departed = Departed(oldest.state, joined_imu(frames[1]), _finished(window, s.track[goes & ~divided]))
+    ended = _finished(window, s.track[goes & ~divided])
+    departed = Departed(oldest.state, joined_imu(frames[1]), ended, oldest.still_sigma > 0.0)
     window.prior = _prior_after(window, problem, oldest)
     window.beliefs.pop(("frame", oldest.key), None)
     for i, frame in enumerate(frames):

@@ -165,12 +165,13 @@ class Landmarks:
 class Departed:
     """A keyframe that left, as the window saw it last, and the landmarks that ended with it.
 
-    imu : from this keyframe to the next
+    imu : from this keyframe to the next; still : it was at a standstill
     """
 
     state: NavState
     imu: ImuSamples
     landmarks: Landmarks
+    still: bool = False
 
     @property
     def t_ns(self) -> int:

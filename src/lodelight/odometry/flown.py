@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lodelight.estimation.inertial_bundle import REST, ImuChain
+from lodelight.estimation.inertial_bundle import REST, ImuChain, standing
 from lodelight.estimation.window_frames import prepared
 from lodelight.imu.preintegration import NavState, preintegrate
 from lodelight.imu.samples import ImuSamples
@@ -17,12 +17,12 @@ from lodelight.types import Array, Ints
 @dataclass(eq=False)
 class Flown:
     """Keyframes of the windows in the order of their stamps: number in the map (-1 = not there), state, the samples to
-    the next one (None = a window ended here), and the noise of the IMU at the time."""
+    the next one (None = a window ended here), the noise of the IMU at the time, and whether it stood still."""
 
-    entries: list[tuple[int, NavState, ImuSamples | None, ImuSpec]] = field(default_factory=list)
+    entries: list[tuple[int, NavState, ImuSamples | None, ImuSpec, bool]] = field(default_factory=list)
 
-    def add(self, keyframe: int, state: NavState, imu: ImuSamples | None, spec: ImuSpec) -> None:
-        self.entries.append((keyframe, state, imu, spec))
+    def add(self, keyframe: int, state: NavState, imu: ImuSamples | None, spec: ImuSpec, still: bool) -> None:
+        self.entries.append((keyframe, state, imu, spec, still))
 
     def chain(self, keyframes: Ints, R: Array) -> ImuChain | None:
         """Between those of the keyframes (K,), sorted, that flew; R (K, 3, 3) as they stand now, by which velocities
@@ -30,27 +30,33 @@ class Flown:
         rest = np.zeros((len(keyframes), REST))
         links: list[tuple[int, int, Array, Array]] = []
         first: list[int] = []
+        at_rest: list[int] = []
+        stood = False  # ever since `last`
         last, since = -1, None  # row of the last keyframe, and the samples since then
         begun = False  # whether a link has come to `last`
-        for keyframe, state, imu, spec in self.entries:
+        for keyframe, state, imu, spec, still in self.entries:
+            stood &= still
             row = int(np.searchsorted(keyframes, keyframe)) if keyframe >= 0 else len(keyframes)
             if row < len(keyframes) and keyframes[row] == keyframe:
                 if last >= 0 and since is not None:
                     bias_gyro, bias_accel = rest[last, 3:6], rest[last, 6:]
                     links.append((last, row, *prepared(preintegrate(since, bias_gyro, bias_accel, spec))))
+                    links += [(last, row, *standing())] if stood else []
                     first += [] if begun else [last]
                 begun = last >= 0 and since is not None
                 v_world = R[row] @ state.T_world_body.R.T @ state.v_world
                 rest[row] = np.concatenate([v_world, state.bias_gyro, state.bias_accel])
-                last, since = row, imu
+                last, since, stood = row, imu, still
+                at_rest += [row] if still else []
             elif since is not None:
                 since = None if imu is None else since.joined(imu)
             if imu is None:
                 last, since, begun = -1, None, False
         if not links:
             return None
+        linked = {row for link in links for row in link[:2]}
         before, after, measured, whiten = zip(*links, strict=True)
         return ImuChain(
             np.array(before, np.int32), np.array(after, np.int32), np.stack(measured), np.stack(whiten),
-            np.array(first, np.int32), rest,
+            np.array(first, np.int32), rest, np.array([k for k in at_rest if k in linked], np.int32),
         )  # fmt: skip
