@@ -8,18 +8,19 @@ stays linearized where it was wrong. Derivation: docs/derivations-inertial.md. S
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lodelight.compiled import kernel
 from lodelight.estimation.bundle import Adjustment, Linear, State
 from lodelight.estimation.bundle_problem import BundleProblem, BundleResult, as_f64
-from lodelight.estimation.factors.inertial import DR, MEASUREMENT, inertial_jacobian, inertial_residual
-from lodelight.types import Array, Bools, Ints
+from lodelight.estimation.factors.inertial import DP, DR, MEASUREMENT, inertial_jacobian, inertial_residual
+from lodelight.types import AnyArray, Array, Bools, Ints
 
 SIGMA_BIAS_GYRO, SIGMA_BIAS_ACCEL = 0.1, 0.2  # rad/s, m/s^2: of a chain's first biases, about zero
 STILL_M_S, STILL_M = 0.01, 0.001  # at a standstill, as in the window
+P_ROWS, P_END = slice(3, 6), 5  # of a link's residuals; the last of the way's
 REST = 9  # velocity, gyroscope's bias, accelerometer's bias
 
 
@@ -58,6 +59,31 @@ def standing() -> tuple[Array, Array]:
     measured[DR : DR + 9] = np.eye(3).ravel()
     whiten[range(3, 6), range(3, 6)] = 1.0 / STILL_M
     return measured, whiten
+
+
+def lengths(chain: ImuChain, R: AnyArray, p: AnyArray, variance: Array) -> ImuChain:
+    """With the lengths that the path had until now: from each keyframe of the first half to one of the second.
+
+    R (K, 3, 3), p (K, 3) : the path; variance (K,) m^2 : of its positions, an axis. All err by one scale, so all the
+    lengths together count as one of them.
+    """
+    members = np.unique(np.concatenate([chain.before, chain.after]))
+    half = len(members) // 2
+    before, after = members[:half], members[half : 2 * half]
+    across = np.asarray(p, np.float64)[after] - np.asarray(p, np.float64)[before]
+    measured, whiten = np.zeros((half, MEASUREMENT)), np.zeros((half, 15, 15))
+    measured[:, DR : DR + 9] = np.eye(3).ravel()
+    measured[:, DP : DP + 3] = np.einsum("kji,kj->ki", np.asarray(R, np.float64)[before], across)
+    length = np.linalg.norm(across, axis=1)
+    sigma = np.sqrt(half * np.maximum(variance[after], variance[before])) * np.maximum(length, 1e-9)
+    whiten[:, P_END, P_ROWS] = measured[:, DP : DP + 3] / sigma[:, None]
+    return replace(
+        chain,
+        before=np.concatenate([chain.before, before]).astype(np.int32),
+        after=np.concatenate([chain.after, after]).astype(np.int32),
+        measured=np.concatenate([chain.measured, measured]),
+        whiten=np.concatenate([chain.whiten, whiten]),
+    )
 
 
 @dataclass

@@ -9,7 +9,7 @@ import numpy as np
 
 from lodelight.estimation.bundle_problem import BundleProblem, BundleResult
 from lodelight.estimation.factors.pose_prior import PosePrior
-from lodelight.estimation.inertial_bundle import ImuChain, inertial_bundle_adjust
+from lodelight.estimation.inertial_bundle import ImuChain, inertial_bundle_adjust, lengths
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.local import bundle_of, commit_bundle
@@ -37,6 +37,9 @@ def adjust_with_imu(
         chain = chain_of(keyframes, problem.R)
         if chain is None:
             return False
+        if not metric:
+            variance = np.trace(map.keyframes.covariance[keyframes, 3:, 3:], axis1=1, axis2=2) / 3.0
+            chain = lengths(chain, problem.R, problem.p, variance)
         tied = upright_free(with_tag_corners(map, problem if metric else without_depth(problem), keyframes, window))
     result, rest = inertial_bundle_adjust(tied, chain, iterations)
     for _ in range(WEIGHINGS):
