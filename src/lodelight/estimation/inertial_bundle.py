@@ -70,13 +70,34 @@ def lengths(chain: ImuChain, R: AnyArray, p: AnyArray, variance: Array) -> ImuCh
     members = np.unique(np.concatenate([chain.before, chain.after]))
     half = len(members) // 2
     before, after = members[:half], members[half : 2 * half]
-    across = np.asarray(p, np.float64)[after] - np.asarray(p, np.float64)[before]
-    measured, whiten = np.zeros((half, MEASUREMENT)), np.zeros((half, 15, 15))
+    measured, whiten = _ways(before, after, R, p), np.zeros((half, 15, 15))
+    way = measured[:, DP : DP + 3]
+    sigma = np.sqrt(half * np.maximum(variance[after], variance[before]))
+    whiten[:, P_END, P_ROWS] = way / (sigma * np.maximum(np.linalg.norm(way, axis=1), 1e-9))[:, None]
+    return _joined(chain, before, after, measured, whiten)
+
+
+def tied(chain: ImuChain, unseen: Bools, R: AnyArray, p: AnyArray, variance: Array) -> ImuChain:
+    """With keyframes that have no points (K,) left where the path (see `lengths`) had them beside the next ones."""
+    pairs = np.unique(np.stack([chain.before, chain.after], axis=1), axis=0)
+    before, after = pairs[unseen[pairs].any(axis=1)].T
+    whiten = np.zeros((len(before), 15, 15))
+    sigma = np.sqrt(np.maximum(variance[before], variance[after]) + STILL_M**2)
+    for row in range(3, 6):
+        whiten[:, row, row] = 1.0 / sigma
+    return _joined(chain, before, after, _ways(before, after, R, p), whiten)
+
+
+def _ways(before: Ints, after: Ints, R: AnyArray, p: AnyArray) -> Array:
+    """(L, 76) of links over no time: from where to where the path went, in the frame of the first."""
+    R, p = np.asarray(R, np.float64), np.asarray(p, np.float64)
+    measured = np.zeros((len(before), MEASUREMENT))
     measured[:, DR : DR + 9] = np.eye(3).ravel()
-    measured[:, DP : DP + 3] = np.einsum("kji,kj->ki", np.asarray(R, np.float64)[before], across)
-    length = np.linalg.norm(across, axis=1)
-    sigma = np.sqrt(half * np.maximum(variance[after], variance[before])) * np.maximum(length, 1e-9)
-    whiten[:, P_END, P_ROWS] = measured[:, DP : DP + 3] / sigma[:, None]
+    measured[:, DP : DP + 3] = np.einsum("kji,kj->ki", R[before], p[after] - p[before])
+    return measured
+
+
+def _joined(chain: ImuChain, before: Ints, after: Ints, measured: Array, whiten: Array) -> ImuChain:
     return replace(
         chain,
         before=np.concatenate([chain.before, before]).astype(np.int32),

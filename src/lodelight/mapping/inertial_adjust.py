@@ -9,7 +9,7 @@ import numpy as np
 
 from lodelight.estimation.bundle_problem import BundleProblem, BundleResult
 from lodelight.estimation.factors.pose_prior import PosePrior
-from lodelight.estimation.inertial_bundle import ImuChain, inertial_bundle_adjust, lengths
+from lodelight.estimation.inertial_bundle import ImuChain, inertial_bundle_adjust, lengths, tied
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.mapping.local import bundle_of, commit_bundle
@@ -19,6 +19,7 @@ from lodelight.types import Array, Ints
 
 WEIGHINGS = 2  # times that the corners' noise is found from what is left of them
 WEIGHED = (0.4, 3.0)  # by no more than that at a time
+MIN_POINTS = 3  # that a keyframe can be located by
 FREE_TILT, HELD_YAW, HELD_M = 0.1, 1e-4, 1e-4  # rad, rad, m: of the root, whose vertical the IMU knows better
 
 
@@ -37,16 +38,18 @@ def adjust_with_imu(
         chain = chain_of(keyframes, problem.R)
         if chain is None:
             return False
+        variance = np.trace(map.keyframes.covariance[keyframes, 3:, 3:], axis1=1, axis2=2) / 3.0
+        unseen = np.bincount(problem.keyframe, minlength=len(keyframes)) < MIN_POINTS
+        chain = tied(chain, unseen, problem.R, problem.p, variance)
         if not metric:
-            variance = np.trace(map.keyframes.covariance[keyframes, 3:, 3:], axis1=1, axis2=2) / 3.0
             chain = lengths(chain, problem.R, problem.p, variance)
-        tied = upright_free(with_tag_corners(map, problem if metric else without_depth(problem), keyframes, window))
-    result, rest = inertial_bundle_adjust(tied, chain, iterations)
+        whole = upright_free(with_tag_corners(map, problem if metric else without_depth(problem), keyframes, window))
+    result, rest = inertial_bundle_adjust(whole, chain, iterations)
     for _ in range(WEIGHINGS):
-        tied = weighed(tied, result)
-        result, rest = inertial_bundle_adjust(tied, replace(chain, rest=rest), iterations)
+        whole = weighed(whole, result)
+        result, rest = inertial_bundle_adjust(whole, replace(chain, rest=rest), iterations)
     with map.lock:
-        commit_bundle(map, result.R, result.p, result.xyz[: len(points)], tied.fixed, keyframes, points)
+        commit_bundle(map, result.R, result.p, result.xyz[: len(points)], whole.fixed, keyframes, points)
         still = map.features.point[rows] == points[problem.point]
         map.unlink(rows[~result.inliers[: len(rows)] & still])
         map.refresh_points(points[map.points.alive[points]], orb.scale_factor, orb.n_levels)
