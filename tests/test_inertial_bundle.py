@@ -11,7 +11,14 @@ import pytest
 from inertial_scenes import look, project, samples_near, scene, state_error
 from lodelight.estimation.bundle_problem import BundleProblem
 from lodelight.estimation.factors.pose_prior import PosePrior
-from lodelight.estimation.inertial_bundle import ImuChain, InertialAdjustment, inertial_bundle_adjust
+from lodelight.estimation.inertial_bundle import (
+    ImuChain,
+    InertialAdjustment,
+    inertial_bundle_adjust,
+    lengths,
+    standing,
+    tied,
+)
 from lodelight.estimation.window_frames import prepared
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp
@@ -82,6 +89,9 @@ def walk() -> tuple[BundleProblem, ImuChain, list[NavState]]:
 
 def test_the_slope_is_that_of_the_cost(walk):
     problem, chain, _ = walk
+    chain = lengths(
+        replace(chain, still=np.array([7], np.int32)), problem.R, 1.02 * problem.p, np.full(len(problem.p), 1e-4)
+    )
     a = InertialAdjustment(problem, [], chain)
     a._linearize(a.state, a.linear, False, a.linear.chi2)
     g_pose, g_rest = a.linear.g_pose.copy(), a.linear.chain_g.copy()
@@ -144,3 +154,46 @@ def test_corners_that_fit_better_than_assumed_count_more(walk):
     assert np.median(again.sigma_px / problem.sigma_px) == pytest.approx(1.0, abs=0.1)
     result, _ = inertial_bundle_adjust(again, replace(chain, rest=rest), 5)
     assert np.median(weighed(again, result).sigma_px / again.sigma_px) == pytest.approx(1.0, abs=0.15)
+
+
+def test_lengths_that_are_known_well_decide_over_the_scale(walk):
+    problem, chain, truth = walk
+    scale = []
+    for sigma_m in (1e-3, 10.0):
+        known = lengths(chain, problem.R, problem.p, np.full(len(problem.p), sigma_m**2))  # stretched, as the start is
+        result, _ = inertial_bundle_adjust(problem, known, 30)
+        steps = (
+            np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (result.p, [t.T_world_body.t for t in truth])
+        )
+        scale.append(next(steps) / next(steps))
+    assert scale[0] == pytest.approx(STRETCH, abs=0.01)
+    assert scale[1] == pytest.approx(1.0, abs=0.01)
+
+
+def test_who_stands_or_sees_no_points_stays_beside_the_next(walk):
+    """Four seconds before the first that sees, by an IMU alone: it would be anywhere within decimetres."""
+    problem, chain, truth = walk
+    k, imu = 17, chain.whiten.copy()
+    imu[:, :9] *= 0.01  # of an IMU that knows next to nothing
+    unseen = np.arange(len(problem.R)) < k
+    seen = ~unseen[problem.keyframe]
+    p = np.stack([t.T_world_body.t for t in truth])
+    blind = replace(
+        problem, R=np.stack([t.T_world_body.R for t in truth]), p=p, keyframe=problem.keyframe[seen],
+        point=problem.point[seen], px=problem.px[seen], sigma_px=problem.sigma_px[seen],
+        inv_depth=problem.inv_depth[seen], sigma_inv_depth=problem.sigma_inv_depth[seen],
+    )  # fmt: skip
+    poor = replace(chain, whiten=imu)
+    result, _ = inertial_bundle_adjust(blind, tied(poor, unseen, blind.R, p, np.full(len(p), 1e-6)))
+    way = np.einsum("kji,kj->ki", result.R[: k - 1], np.diff(result.p[:k], axis=0))
+    true = np.einsum("kji,kj->ki", blind.R[: k - 1], np.diff(p[:k], axis=0))
+    assert np.abs(way - true).max() < 5e-3
+    measured, whiten = standing()
+    links = replace(
+        poor, before=np.append(poor.before, 0).astype(np.int32), after=np.append(poor.after, 1).astype(np.int32),
+        measured=np.concatenate([poor.measured, measured[None]]), whiten=np.concatenate([poor.whiten, whiten[None]]),
+        still=np.array([0, 1], np.int32),
+    )  # fmt: skip
+    result, rest = inertial_bundle_adjust(blind, links)
+    assert np.linalg.norm(result.p[1] - result.p[0]) < 2e-3
+    assert np.abs(rest[:2, :3]).max() < 0.05
