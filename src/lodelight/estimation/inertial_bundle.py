@@ -62,17 +62,19 @@ def standing() -> tuple[Array, Array]:
 
 
 def lengths(chain: ImuChain, R: AnyArray, p: AnyArray, variance: Array) -> ImuChain:
-    """With the lengths that the path had until now: from each keyframe of the first half to one of the second.
+    """With the lengths that the path had until now: from each keyframe of a chain's first half to one of its second.
 
     R (K, 3, 3), p (K, 3) : the path; variance (K,) m^2 : of its positions, an axis. All err by one scale, so all the
-    lengths together count as one of them.
+    lengths of a chain together count as one of them.
     """
     members = np.unique(np.concatenate([chain.before, chain.after]))
-    half = len(members) // 2
-    before, after = members[:half], members[half : 2 * half]
-    measured, whiten = _ways(before, after, R, p), np.zeros((half, 15, 15))
+    chains = np.split(members, np.searchsorted(members, chain.first[1:]))
+    halves = np.array([len(rows) // 2 for rows in chains])
+    before = np.concatenate([rows[:half] for rows, half in zip(chains, halves, strict=True)])
+    after = np.concatenate([rows[half : 2 * half] for rows, half in zip(chains, halves, strict=True)])
+    measured, whiten = _ways(before, after, R, p), np.zeros((len(before), 15, 15))
     way = measured[:, DP : DP + 3]
-    sigma = np.sqrt(half * np.maximum(variance[after], variance[before]))
+    sigma = np.sqrt(np.repeat(halves, halves) * (np.maximum(variance[after], variance[before]) + STILL_M**2))
     whiten[:, P_END, P_ROWS] = way / (sigma * np.maximum(np.linalg.norm(way, axis=1), 1e-9))[:, None]
     return _joined(chain, before, after, measured, whiten)
 
