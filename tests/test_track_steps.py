@@ -33,17 +33,17 @@ def problem(request: pytest.FixtureRequest) -> Problem:
     return build(window)[0]
 
 
-def seen_cost(problem: Problem, x: Unknowns) -> float:
-    """Of the sightings alone, all else left out."""
-    out = problem._allocated()
-    s = problem.sightings
+def seen(problem: Problem, x: Unknowns):
+    """Cost and slope of the sightings alone, all else left out."""
+    out, s = problem._allocated(), problem.sightings
+    out.H[:], out.g[:] = 0.0, 0.0
     kernels.visual_terms(
         x.frames, x.frames, problem.motion, problem.models, problem.params, x.mounts, x.mounts, 0.0, problem.base,
         x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
         problem.active, False, out.chi2, problem.usual_inv_depth, problem.pose_at, -1, -1, out.H, out.g, out.V,
         out.g_landmark, out.W, out.chi2,
     )  # fmt: skip
-    return float(out.chi2.sum())
+    return out
 
 
 def test_every_row_is_held_against_the_right_one(problem: Problem):
@@ -63,15 +63,8 @@ def test_every_row_is_held_against_the_right_one(problem: Problem):
 
 
 def test_the_slope_is_that_of_the_cost(problem: Problem):
-    out, x = problem._allocated(), problem.state
-    out.H[:], out.g[:] = 0.0, 0.0
-    s = problem.sightings
-    kernels.visual_terms(
-        x.frames, x.frames, problem.motion, problem.models, problem.params, x.mounts, x.mounts, 0.0, problem.base,
-        x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
-        problem.active, False, out.chi2, problem.usual_inv_depth, problem.pose_at, -1, -1, out.H, out.g, out.V,
-        out.g_landmark, out.W, out.chi2,
-    )  # fmt: skip
+    x = problem.state
+    out = seen(problem, x)
     for f in (0, 2, 4):
         for a in range(6):
             slopes = []
@@ -82,6 +75,6 @@ def test_the_slope_is_that_of_the_cost(problem: Problem):
                     frames[f, :9] = (frames[f, :9].reshape(3, 3) @ turn).ravel()
                 else:
                     frames[f, 6 + a] += h
-                slopes.append(seen_cost(problem, replace(x, frames=frames)))
+                slopes.append(float(seen(problem, replace(x, frames=frames)).chi2.sum()))
             numeric = (slopes[0] - slopes[1]) / 4e-6
             assert out.g[problem.pose_at + 6 * f + a] == pytest.approx(numeric, rel=1e-4, abs=1e-2)

@@ -8,11 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 from lodelight.errors import LodelightError
-from lodelight.ros.wiring import LATCHED, PUBLISHED, Parameters, Wiring
+from lodelight.ros.wiring import LATCHED, PUBLISHED, Parameters, message_types, run_node
 
 QUEUE = 100  # samples of an IMU come faster than images
 
@@ -22,21 +21,11 @@ class Ros1:
 
     def __init__(self) -> None:
         import rospy
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-        from geometry_msgs.msg import PoseStamped, TransformStamped
-        from nav_msgs.msg import Odometry, Path
-        from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2, PointField
         from std_srvs.srv import SetBool, SetBoolResponse, Trigger, TriggerResponse
-        from tf2_msgs.msg import TFMessage
 
         self._rospy = rospy
         self._services = (Trigger, TriggerResponse), (SetBool, SetBoolResponse)
-        self.types = SimpleNamespace(
-            DiagnosticArray=DiagnosticArray, DiagnosticStatus=DiagnosticStatus, KeyValue=KeyValue,
-            PoseStamped=PoseStamped, TransformStamped=TransformStamped, Odometry=Odometry, Path=Path,
-            CameraInfo=CameraInfo, CompressedImage=CompressedImage, Image=Image, Imu=Imu, PointCloud2=PointCloud2,
-            PointField=PointField, TFMessage=TFMessage,
-        )  # fmt: skip
+        self.types = message_types()
         rospy.init_node("lodelight")
         self._publishers = {
             name: rospy.Publisher(name, getattr(self.types, kind), queue_size=10, latch=name in LATCHED)
@@ -74,22 +63,5 @@ class Ros1:
         self._rospy.spin()
 
 
-def main() -> int:
-    """Runs until the node is shut down; returns an exit status."""
-    try:
-        ros = Ros1()
-    except ImportError as error:
-        print(f"lodelight: {error}; source your ROS 1, or install its Python packages", file=sys.stderr)
-        return 2
-    try:
-        wiring = Wiring(ros, ros.parameters())
-    except LodelightError as error:
-        print(f"lodelight: {type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    ros.spin()
-    wiring.close()
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_node(Ros1, "source your ROS 1, or install its Python packages"))

@@ -8,11 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 from lodelight.errors import LodelightError
-from lodelight.ros.wiring import LATCHED, PUBLISHED, Parameters, Wiring
+from lodelight.ros.wiring import LATCHED, PUBLISHED, Parameters, message_types, run_node
 
 DEPTH = 100  # of the queues; samples of an IMU come faster than images
 
@@ -23,21 +22,11 @@ class Ros2:
     def __init__(self) -> None:
         import rclpy
         from builtin_interfaces.msg import Time
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-        from geometry_msgs.msg import PoseStamped, TransformStamped
-        from nav_msgs.msg import Odometry, Path
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-        from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2, PointField
         from std_srvs.srv import SetBool, Trigger
-        from tf2_msgs.msg import TFMessage
 
         self._rclpy, self._time, self._services = rclpy, Time, (Trigger, SetBool)
-        self.types = SimpleNamespace(
-            DiagnosticArray=DiagnosticArray, DiagnosticStatus=DiagnosticStatus, KeyValue=KeyValue,
-            PoseStamped=PoseStamped, TransformStamped=TransformStamped, Odometry=Odometry, Path=Path,
-            CameraInfo=CameraInfo, CompressedImage=CompressedImage, Image=Image, Imu=Imu, PointCloud2=PointCloud2,
-            PointField=PointField, TFMessage=TFMessage,
-        )  # fmt: skip
+        self.types = message_types()
         rclpy.init()
         self._node = rclpy.create_node("lodelight")
         # a subscriber that asks for no more than best effort hears every publisher
@@ -89,22 +78,5 @@ class Ros2:
             self._rclpy.try_shutdown()
 
 
-def main() -> int:
-    """Runs until the node is shut down; returns an exit status."""
-    try:
-        ros = Ros2()
-    except ImportError as error:
-        print(f"lodelight: {error}; source your ROS 2", file=sys.stderr)
-        return 2
-    try:
-        wiring = Wiring(ros, ros.parameters())
-    except LodelightError as error:
-        print(f"lodelight: {type(error).__name__}: {error}", file=sys.stderr)
-        return 2
-    ros.spin()
-    wiring.close()
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_node(Ros2, "source your ROS 2"))

@@ -5,9 +5,11 @@ A ROS is handed in as a `Ros`; nothing here imports one.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
@@ -34,6 +36,13 @@ class Ros(Protocol):
     def publish(self, name: str, message: Any) -> None: ...
     def service(self, name: str, switch: bool, fn: Callable[[Any], str]) -> None: ...
     def log(self, text: str, error: bool = False) -> None: ...
+
+
+class Host(Ros, Protocol):
+    """A ROS that a node lives in, from its parameters to its shutdown."""
+
+    def parameters(self) -> Parameters: ...
+    def spin(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -198,3 +207,36 @@ PUBLISHED = {
     "odom": "Odometry", "path": "Path", "cloud": "PointCloud2", "/tf": "TFMessage", "/diagnostics": "DiagnosticArray"
 }  # fmt: skip
 LATCHED = ("path", "cloud")  # for those who listen later
+
+
+def message_types() -> SimpleNamespace:
+    """The message classes, which both ROS name alike. Raises ImportError where there is no ROS."""
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from geometry_msgs.msg import PoseStamped, TransformStamped
+    from nav_msgs.msg import Odometry, Path
+    from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2, PointField
+    from tf2_msgs.msg import TFMessage
+
+    return SimpleNamespace(
+        DiagnosticArray=DiagnosticArray, DiagnosticStatus=DiagnosticStatus, KeyValue=KeyValue,
+        PoseStamped=PoseStamped, TransformStamped=TransformStamped, Odometry=Odometry, Path=Path,
+        CameraInfo=CameraInfo, CompressedImage=CompressedImage, Image=Image, Imu=Imu, PointCloud2=PointCloud2,
+        PointField=PointField, TFMessage=TFMessage,
+    )  # fmt: skip
+
+
+def run_node(host: Callable[[], Host], missing: str) -> int:
+    """Runs until the node is shut down; returns an exit status. missing : what to do where there is no such ROS"""
+    try:
+        ros = host()
+    except ImportError as error:
+        print(f"lodelight: {error}; {missing}", file=sys.stderr)
+        return 2
+    try:
+        wiring = Wiring(ros, ros.parameters())
+    except LodelightError as error:
+        print(f"lodelight: {type(error).__name__}: {error}", file=sys.stderr)
+        return 2
+    ros.spin()
+    wiring.close()
+    return 0
