@@ -40,7 +40,7 @@ def seen(problem: Problem, x: Unknowns):
     kernels.visual_terms(
         x.frames, x.frames, problem.motion, problem.models, problem.params, x.mounts, x.mounts, 0.0, problem.base,
         x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
-        problem.active, False, out.chi2, problem.usual_inv_depth, problem.pose_at, -1, -1, out.H, out.g, out.V,
+        problem.active, False, out.chi2, problem.usual_inv_depth, problem.pose_at, -1, -1, True, out.H, out.g, out.V,
         out.g_landmark, out.W, out.chi2,
     )  # fmt: skip
     return out

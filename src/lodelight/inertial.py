@@ -41,18 +41,24 @@ MIN_MATCHES = 20  # of map points, below which they do not tell a keyframe's pla
 class Located:
     """One frame: its estimate, and where it hangs: reference is a keyframe of the map, -1 where there is none.
 
-    inserted : the keyframe that this frame became, -1 where it did not; why : the reason
-    tags : that were seen in it; before : of a keyframe, its reference until then and where it was beside that
+    keyframe : what `InertialFront.insert` makes a keyframe of, None where it becomes none
+    tags : that were seen in it
     """
 
     frame: Frame
     estimate: Estimate
     reference: int
     T_reference_body: SE3
-    inserted: int = -1
-    why: str = ""
+    keyframe: NewKeyframe | None = None
     tags: tuple[TagSighting, ...] = ()
-    before: tuple[int, SE3] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NewKeyframe:
+    """A keyframe of the window that is to be one of the map; landmarks : of the window at the time."""
+
+    step: OdometryStep
+    landmarks: Landmarks
 
 
 class InertialFront:
@@ -76,7 +82,6 @@ class InertialFront:
         self._known = len(map.keyframes) > 0  # a map that the camera must first be found in
         self._reference = -1
         self._T_map_reference = SE3.identity()
-        self._in_window: dict[int, int] = {}  # keyframes of the map by their stamps
         self.flown = Flown()
         self._window: Window | None = None  # that the last frame was in
         mapper.hold_poses = True  # the window has placed them, with the IMU
@@ -112,19 +117,17 @@ class InertialFront:
         self._window = self.odometry.window
         if step.status not in ("tracking", "degraded"):
             return self._nowhere(step, clock)
-        inserted, before = -1, None
+        new = None
+        if step.keyframe and not self.localization_only:
+            assert self.odometry.window is not None
+            new = NewKeyframe(step, self.odometry.window.landmarks())
         with self.map.lock:
             self._settle_departed()
-            if step.keyframe:
-                if self._known and self._reference < 0 and not self._found(step):
-                    return self._nowhere(step, clock, "not found in the map yet")
-                if self._reference >= 0 and not step.restarted:
-                    before = self._reference, self._T_map_reference.inverse() @ step.state.T_world_body
-                inserted = self._insert(step)
-                before = before if inserted >= 0 else None
-            elif self._reference < 0:
+            if self._reference < 0 and self._known and step.keyframe:
+                self._find(step)
+            if self._reference < 0 and (self._known or new is None):
                 return self._nowhere(step, clock, "not found in the map yet")
-            T_world_map = self.T_world_map
+            reference, T_world_map = self._reference, self.T_world_map
             T_world_body = T_world_map @ step.state.T_world_body
             T_reference_body = self._T_map_reference.inverse() @ step.state.T_world_body
         covariance = step.covariance[:6, :6].copy()
@@ -134,9 +137,7 @@ class InertialFront:
         estimate = Estimate(
             t_ns, step.status, T_world_body, turn @ covariance @ turn.T, step.why, step.inliers, details
         )  # fmt: skip
-        return Located(
-            step.frame, estimate, self._reference, T_reference_body, inserted, step.keyframe, step.tags, before
-        )  # fmt: skip
+        return Located(step.frame, estimate, reference, T_reference_body, new, step.tags)
 
     def _nowhere(self, step: OdometryStep, clock: Stopwatch, why: str = "") -> Located:
         T = self.T_world_map @ step.state.T_world_body
@@ -145,11 +146,11 @@ class InertialFront:
         estimate = Estimate(step.frame.t_ns, status, T, LOST_COVARIANCE, why or step.why, 0, details)
         return Located(step.frame, estimate, -1, SE3.identity())
 
-    def _found(self, step: OdometryStep) -> bool:
+    def _find(self, step: OdometryStep) -> None:
         """Look for a frame in the map that was given; sets where the odometry's frame lies in it."""
         found = self.find(self.front_end.process(step.frame))
         if isinstance(found, str):
-            return False
+            return
         T_world_map = level(found.T_world_body @ step.state.T_world_body.inverse(), step.state.T_world_body)
         match = np.flatnonzero(found.point >= 0)
         observers = self.map.shared_counts(found.point[match])
@@ -157,18 +158,21 @@ class InertialFront:
         self._T_map_reference = T_world_map.inverse() @ self.map.pose(self._reference)
         self.relocalizations += 1
         self.emit(step.frame.t_ns, "relocalized", why=found.why)
-        return True
 
-    def _insert(self, step: OdometryStep) -> int:
-        """A keyframe of the window becomes one of the map."""
-        if self.localization_only:
-            return -1
-        T_world_body = self.T_world_map @ step.state.T_world_body
+    def insert(self, new: NewKeyframe) -> int:
+        """A keyframe of the window becomes one of the map, and the reference of the frames that follow; its number.
+
+        What takes long in it the next frame need not wait for: from the thread that maps.
+        """
+        step = new.step
         seen = self.front_end.process(step.frame)
-        window = self.odometry.window
-        assert window is not None
         if not (seen.inv_depth > 0).any():
-            seen = with_landmark_depth(seen, step.tracks, window.landmarks(), self._T_map_cam(step))
+            seen = with_landmark_depth(seen, step.tracks, new.landmarks, self._T_map_cam(step))
+        with self.map.lock:
+            return self._insert(step, seen)
+
+    def _insert(self, step: OdometryStep, seen: Features) -> int:
+        T_world_body = self.T_world_map @ step.state.T_world_body
         nothing = np.full(len(seen), -1, np.int32)
         tracked = Tracked(
             step.frame.t_ns, seen, T_world_body, step.covariance[:6, :6], nothing, max(self._reference, 0)
@@ -186,7 +190,7 @@ class InertialFront:
         tracked.reference = keyframe
         self.tracker.accept(tracked)
         self._reference, self._T_map_reference = keyframe, step.state.T_world_body
-        self._in_window[step.frame.t_ns] = keyframe
+        self.flown.number[step.frame.t_ns] = keyframe
         return keyframe
 
     def _T_map_cam(self, step: OdometryStep) -> SE3:
@@ -199,8 +203,8 @@ class InertialFront:
             return
         T_world_map = self.T_world_map
         for gone in window.departed():
-            keyframe = self._in_window.pop(gone.t_ns, -1)
-            self.flown.add(keyframe, gone.state, gone.imu, self.odometry.spec, gone.still)
+            keyframe = self.flown.number.get(gone.t_ns, -1)
+            self.flown.add(gone.state, gone.imu, self.odometry.spec, gone.still)
             if keyframe >= 0 and keyframe != self._reference and self.map.keyframes.alive[keyframe]:
                 self.map.set_pose(keyframe, T_world_map @ gone.state.T_world_body)
 
@@ -214,12 +218,11 @@ class InertialFront:
     def _leave(self, window: Window) -> None:
         """A window that ends: its keyframes have flown."""
         for gone in window.departed():
-            self.flown.add(self._in_window.pop(gone.t_ns, -1), gone.state, gone.imu, self.odometry.spec, gone.still)
+            self.flown.add(gone.state, gone.imu, self.odometry.spec, gone.still)
         frames = [frame for frame in window.frames if frame.keyframe]
         for frame, after in zip(frames, [*frames[1:], None], strict=True):
             imu = after.imu.samples if after is not None and after.imu is not None else None
-            keyframe, still = self._in_window.pop(frame.t_ns, -1), frame.still_sigma > 0.0
-            self.flown.add(keyframe, frame.state, imu, self.odometry.spec, still)
+            self.flown.add(frame.state, imu, self.odometry.spec, frame.still_sigma > 0.0)
 
 
 def level(T: SE3, T_inner: SE3) -> SE3:

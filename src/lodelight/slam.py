@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3, carried_covariance
-from lodelight.inertial import InertialFront, Located
+from lodelight.inertial import InertialFront, Located, NewKeyframe
 from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording, woven
 from lodelight.localization.machine import LocalizationMachine
@@ -67,6 +67,18 @@ class SlamConfig:
     inertial: OdometryConfig = field(default_factory=OdometryConfig)
 
 
+@dataclass(frozen=True, eq=False)
+class FlownKeyframe:
+    """A frame of the inertial window that is to become a keyframe; at : its node of the path."""
+
+    located: Located
+    new: NewKeyframe
+    at: int
+
+
+MappingJob: TypeAlias = int | FlownKeyframe  # a keyframe of the map, or one that has yet to come into it
+
+
 class Slam:
     """Simultaneous localization and mapping with RGB-D or stereo, or with any camera and an IMU.
 
@@ -113,7 +125,8 @@ class Slam:
             )  # fmt: skip
         self.live = live
         self.localization_only = False
-        self.mapping = (ThreadedMapping if live else InlineMapping)(self._map)
+        work: Callable[[MappingJob], None] = self._map
+        self.mapping = ThreadedMapping(work) if live else InlineMapping(work)
         self.mapping_ms: list[float] = []
         self.path: list[PathNode] = []
         self.relocalizations = 0
@@ -257,15 +270,14 @@ class Slam:
     def _take(self, located: Located) -> Estimate:
         """What the inertial half made of a frame: into the path, and its keyframe to mapping."""
         estimate = located.estimate
-        if located.reference >= 0 and estimate.localized:
-            self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body, located.before))
-        if located.inserted >= 0:
-            self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.why, weight=1.0)
-            with self.map.lock:
-                self.tags.note(located.tags, located.inserted, SE3.identity(), estimate.covariance, own=True)
-            self.mapping.submit(located.inserted)
         if not estimate.localized:
             return estimate
+        self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body))
+        if located.keyframe is not None:
+            self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.keyframe.step.keyframe, weight=1.0)
+            flown = FlownKeyframe(located, located.keyframe, len(self.path) - 1)
+            # the first of all must be there before another frame can hang on it
+            self.mapping.submit(self._put(flown) if located.reference < 0 else flown)
         T_world_body, covariance = self.tags.world(estimate.T_world_body), estimate.covariance
         details = {**estimate.details, "aligned": float(self.tags.aligned)}
         return replace(
@@ -287,8 +299,20 @@ class Slam:
         self._peak_inliers = 0
         self.mapping.submit(keyframe)
 
-    def _map(self, keyframe: int) -> None:
+    def _put(self, flown: FlownKeyframe) -> int:
+        """A keyframe of the inertial window into the map: there its frame hangs on itself."""
+        located, node = flown.located, self.path[flown.at]
+        keyframe = self.inertial.insert(flown.new) if self.inertial is not None else -1
+        alone = node.reference < 0 or flown.new.step.restarted
+        before = None if alone else (node.reference, node.T_reference_body)
+        self.path[flown.at] = PathNode(node.t_ns, keyframe, SE3.identity(), before)
+        with self.map.lock:
+            self.tags.note(located.tags, keyframe, SE3.identity(), located.estimate.covariance, own=True)
+        return keyframe
+
+    def _map(self, job: MappingJob) -> None:
         clock = Stopwatch()
+        keyframe = job if isinstance(job, int) else self._put(job)
         self.mapper.process(keyframe, self.mapping.interrupted)
         if self.map.keyframes.alive[keyframe]:
             self.loops.process(keyframe, self.mapping.interrupted)

@@ -133,13 +133,13 @@ def visual_terms(
     x: Array, lin: Array, motion: Array, models: Ints, params: Array, mount: Array, mount_lin: Array,
     offset_s: float, base: Array, landmark: Array, start: Ints, frame: Ints, camera: Ints, before_row: Ints, px: Array,
     sigma_px: Array, inv_depth: Array, sigma_inv_depth: Array, shift_s: Array, active: Bools, robust: bool,
-    before: Array, usual_inv_depth: float, pose_at: int, mount_at: int, offset_at: int,
+    before: Array, usual_inv_depth: float, pose_at: int, mount_at: int, offset_at: int, normal: bool,
     H: Array, g: Array, V_out: Array, g_landmark: Array, W: Array, chi2: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Add the observations to H (n, n) upper half and g (n,); fill V (M, 6) lower half, g_landmark (M, 3),
     W (M, 3, columns from pose_at on) and chi2 (N,).
 
-    mount_at, offset_at : columns, -1 where not estimated
+    mount_at, offset_at : columns, -1 where not estimated; normal False : only chi2 and the costs are wanted
     Returns the cost, and the cost comparable with the state that had chi-squares `before`.
     """
     Ri, pi, Rj, pj = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
@@ -155,9 +155,10 @@ def visual_terms(
     compact, weighted, J_landmark = np.zeros((3, 48)), np.zeros((3, 48)), np.empty((3, 3))
     bases, widths = np.empty(8, np.int32), np.empty(8, np.int32)
     still = np.zeros((mount.shape[0], 6))
-    V_out[:] = 0.0
-    g_landmark[:] = 0.0
-    W[:] = 0.0
+    if normal:
+        V_out[:] = 0.0
+        g_landmark[:] = 0.0
+        W[:] = 0.0
     cost = comparable = 0.0
     for m in range(len(start) - 1):
         first = start[m]
@@ -185,19 +186,21 @@ def visual_terms(
                 models[cj], lens, Ri, pi, Rci, pci, Rj, pj, Rcj, pcj, here, place,
                 px[o, 0], px[o, 1], 1.0, inv_depth[o], sigma_inv_depth[o], r_own,
             )  # fmt: skip
-            if rows > 0 and not inverse_depth_jacobian(
+            if normal and rows > 0 and not inverse_depth_jacobian(
                 models[cj], lens, Li, li, Lci, lci, Lj, lj, Lcj, lcj, here, place,
                 1.0, inv_depth[o], sigma_inv_depth[o], E, J_own,
             ):  # fmt: skip
                 rows = 0
             good[k] = rows > 0
             if rows > 0:
+                for row in range(3):
+                    r_all[k, row] = r_own[row]
+            if normal and rows > 0:
                 if j != anchor and tau_i != 0.0:
                     _turned_back(J_own, 0, motion, anchor, tau_i)
                 if j != anchor and tau_j != 0.0:
                     _turned_back(J_own, 6, motion, j, tau_j)
                 for row in range(3):
-                    r_all[k, row] = r_own[row]
                     for a in range(27):
                         J_all[k, row, a] = J_own[row, a]
                 if offset_at >= 0:
@@ -230,6 +233,8 @@ def visual_terms(
             cost += value
             if before[o] < math.inf:
                 comparable += value
+            if not normal:
+                continue
             for row in range(3):
                 for a in range(3):
                     J_landmark[row, a] = J_all[k, row, 12 + a]
@@ -271,10 +276,12 @@ def visual_terms(
                     V_out[m, slot] += j0 * J_landmark[0, b] + j1 * J_landmark[1, b] + j2 * J_landmark[2, b]
                     slot += 1
         unusual = (landmark[m, 2] - usual_inv_depth) / SIGMA_INV_DEPTH
-        V_out[m, 5] += 1.0 / (SIGMA_INV_DEPTH * SIGMA_INV_DEPTH)
-        g_landmark[m, 2] += unusual / SIGMA_INV_DEPTH
         cost += unusual * unusual
         comparable += unusual * unusual
+        if not normal:
+            continue
+        V_out[m, 5] += 1.0 / (SIGMA_INV_DEPTH * SIGMA_INV_DEPTH)
+        g_landmark[m, 2] += unusual / SIGMA_INV_DEPTH
         if landmark[m, 2] <= LEAST_INV_DEPTH and g_landmark[m, 2] > 0.0:  # held at its bound
             g_landmark[m, 2] = V_out[m, 3] = V_out[m, 4] = 0.0
             for a in range(W.shape[2]):

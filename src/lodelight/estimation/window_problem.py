@@ -12,7 +12,7 @@ from lodelight.estimation import window_kernels as kernels
 from lodelight.estimation.marginalization import Key, Prior
 from lodelight.types import AnyArray, Array, Bools, Ints
 
-DAMPING_START, DAMPING_MAX = 1e-8, 1e4
+DAMPING_START, DAMPING_MAX = 1e-12, 1e4  # at first too little to be seen in the covariance
 # A step that promises less, in all of the window's hundreds of directions together, is not worth its time: every frame
 # goes on from where the last one ended. What a keyframe leaves behind is linearized once for all, and taken better care
 # of.
@@ -92,6 +92,12 @@ class Linear:
     cost: float = 0.0
     comparable: float = 0.0
 
+    def take_costs(self, other: Linear) -> None:
+        """Of a state so near that these equations hold there as well."""
+        self.chi2, other.chi2 = other.chi2, self.chi2
+        self.tag_chi2, other.tag_chi2 = other.tag_chi2, self.tag_chi2
+        self.cost, self.imu_chi2 = other.cost, other.imu_chi2
+
 
 @dataclass(frozen=True, eq=False)
 class Belief:
@@ -163,6 +169,7 @@ class Problem:
         self.spare = self._allocated()
         self.V_inverse = np.empty((len(self.sightings.track), 6))
         self.S = np.empty((self.n, self.n))
+        self._factored = False  # whether S holds the factor of `linear`, as good as undamped
 
     def _allocated(self) -> Linear:
         M, n = len(self.sightings.track), self.n
@@ -215,7 +222,11 @@ class Problem:
     def lin_tags(self, x: Unknowns) -> Array:
         return np.where(self.frozen_tags[:, None], self.lin.tags, x.tags)
 
-    def linearize(self, x: Unknowns, out: Linear, robust: bool = True, before: Array | None = None) -> None:
+    def linearize(
+        self, x: Unknowns, out: Linear, robust: bool = True, before: Array | None = None, normal: bool = True
+    ) -> None:
+        """Fill `out`. before (N,) : chi-squares of a state that its `comparable` is to be compared with; normal False :
+        only costs and chi-squares are wanted."""
         s, t = self.sightings, self.tag_sightings
         out.H[:] = 0.0
         out.g[:] = 0.0
@@ -228,7 +239,7 @@ class Problem:
             x.frames, frames, self.motion, self.models, self.params, x.mounts, mounts, offset, self.base,
             x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth,
             s.shift_s, self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth,
-            self.pose_at, self.mount_at, self.offset_at,
+            self.pose_at, self.mount_at, self.offset_at, normal,
             out.H, out.g, out.V, out.g_landmark, out.W, out.chi2,
         )  # fmt: skip
         delta = self.offsets(x)[self.prior_at]
@@ -269,6 +280,7 @@ class Problem:
         """Gauss-Newton with as little damping as it needs; returns the steps taken, -1 where it came to nothing."""
         trial = self.state.empty()
         self.linearize(self.state, self.linear)
+        self._factored = False
         damping, taken, tried = DAMPING_START, 0, 0
         while taken < iterations and tried < 3 * iterations + 5:
             tried += 1
@@ -276,12 +288,17 @@ class Problem:
             if 0.0 <= gain < converged_chi2:
                 break
             if gain > 0.0:
-                self.linearize(trial, self.spare, before=self.linear.chi2)
-                if self.spare.comparable <= self.linear.cost + RISE_CHI2:
+                self.linearize(trial, self.spare, before=self.linear.chi2, normal=False)
+                fell = self.linear.cost - self.spare.comparable
+                if fell >= -RISE_CHI2:
                     self.state, trial = trial, self.state if taken else self.state.empty()
-                    self.linear, self.spare = self.spare, self.linear
                     damping = max(0.1 * damping, DAMPING_START)
                     taken += 1
+                    if taken == iterations or abs(fell - gain) < converged_chi2:  # as promised: this is the bottom
+                        self.linear.take_costs(self.spare)
+                        break
+                    self.linearize(self.state, self.linear)
+                    self._factored = False
                     continue
             damping = max(100.0 * damping, 1e-4)
             if damping > DAMPING_MAX:
@@ -291,15 +308,17 @@ class Problem:
 
     def _step(self, damping: float, to: Unknowns) -> float:
         x, at, s = self.state, self.linear, self.sightings
-        return kernels.step(
+        gain = kernels.step(
             damping, x.frames, x.mounts, x.offset_s, x.tags, self.tag_column, x.landmarks, s.start, s.frame,
             self.pose_at, self.mount_at, self.offset_at, self.extra, at.H, at.g, at.V, at.g_landmark, at.W,
             self.V_inverse, self.S, to.frames, to.mounts, to.offset_s, to.tags, to.landmarks,
         )  # fmt: skip
+        self._factored = damping <= DAMPING_START and gain >= 0.0
+        return gain
 
     def covariance(self, columns: AnyArray) -> Array | None:
         """Marginal covariance of these columns at the state, None where the equations are not definite."""
-        if self._step(0.0, self.state.empty()) < 0.0:
+        if not self._factored and self._step(0.0, self.state.empty()) < 0.0:
             return None
         out = kernels.marginal_covariance(self.S, np.ascontiguousarray(columns, np.int32))
         symmetric: Array = 0.5 * (out + out.T)

@@ -48,7 +48,7 @@ class KltConfig:
     tracks: int = 180
     spacing_px: float = 20.0
     window_px: int = 15
-    levels: int = 3
+    levels: int = 2
     back_px: float = 0.7
     min_quality: float = 0.05
     min_contrast: float = 4.0

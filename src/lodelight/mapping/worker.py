@@ -5,21 +5,22 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
-Work = Callable[[int], None]
+Job = TypeVar("Job")
 
 
-class InlineMapping:
+class InlineMapping(Generic[Job]):
     """Every keyframe is mapped before `submit` returns: deterministic."""
 
     idle = True
     queued = 0
 
-    def __init__(self, work: Work) -> None:
+    def __init__(self, work: Callable[[Job], None]) -> None:
         self._work = work
 
-    def submit(self, keyframe: int) -> None:
-        self._work(keyframe)
+    def submit(self, job: Job) -> None:
+        self._work(job)
 
     def interrupted(self) -> bool:
         return False
@@ -28,15 +29,15 @@ class InlineMapping:
         pass
 
 
-class ThreadedMapping:
+class ThreadedMapping(Generic[Job]):
     """Keyframes are mapped in turn on a thread of their own; a waiting one cuts the adjustment of the present short.
 
     What the work raises is raised again by the next `submit`, or by `close`, which waits for all that was submitted.
     """
 
-    def __init__(self, work: Work) -> None:
+    def __init__(self, work: Callable[[Job], None]) -> None:
         self._work = work
-        self._queue: queue.Queue[int | None] = queue.Queue()
+        self._queue: queue.Queue[Job | None] = queue.Queue()
         self._busy = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="mapping", daemon=True)
@@ -50,9 +51,9 @@ class ThreadedMapping:
     def queued(self) -> int:
         return self._queue.qsize()
 
-    def submit(self, keyframe: int) -> None:
+    def submit(self, job: Job) -> None:
         self._raise()
-        self._queue.put(keyframe)
+        self._queue.put(job)
 
     def interrupted(self) -> bool:
         """Asked by the work: should it hurry because another keyframe waits?"""
@@ -69,11 +70,11 @@ class ThreadedMapping:
             raise error
 
     def _run(self) -> None:
-        while (keyframe := self._queue.get()) is not None:
+        while (job := self._queue.get()) is not None:
             self._busy = True
             try:
                 if self._error is None:
-                    self._work(keyframe)
+                    self._work(job)
             except BaseException as error:
                 self._error = error
             self._busy = False

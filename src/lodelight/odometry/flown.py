@@ -16,13 +16,17 @@ from lodelight.types import Array, Ints
 
 @dataclass(eq=False)
 class Flown:
-    """Keyframes of the windows in the order of their stamps: number in the map (-1 = not there), state, the samples to
-    the next one (None = a window ended here), the noise of the IMU at the time, and whether it stood still."""
+    """Keyframes of the windows in the order of their stamps: state, the samples to the next one (None = a window ended
+    here), the noise of the IMU at the time, and whether it stood still.
 
-    entries: list[tuple[int, NavState, ImuSamples | None, ImuSpec, bool]] = field(default_factory=list)
+    number : by stamp, of those that are in the map
+    """
 
-    def add(self, keyframe: int, state: NavState, imu: ImuSamples | None, spec: ImuSpec, still: bool) -> None:
-        self.entries.append((keyframe, state, imu, spec, still))
+    entries: list[tuple[NavState, ImuSamples | None, ImuSpec, bool]] = field(default_factory=list)
+    number: dict[int, int] = field(default_factory=dict)
+
+    def add(self, state: NavState, imu: ImuSamples | None, spec: ImuSpec, still: bool) -> None:
+        self.entries.append((state, imu, spec, still))
 
     def chain(self, keyframes: Ints, R: Array) -> ImuChain | None:
         """Between those of the keyframes (K,), sorted, that flew; R (K, 3, 3) as they stand now, by which velocities
@@ -34,8 +38,9 @@ class Flown:
         stood = False  # ever since `last`
         last, since = -1, None  # row of the last keyframe, and the samples since then
         begun = False  # whether a link has come to `last`
-        for keyframe, state, imu, spec, still in self.entries:
+        for state, imu, spec, still in self.entries:
             stood &= still
+            keyframe = self.number.get(state.t_ns, -1)
             row = int(np.searchsorted(keyframes, keyframe)) if keyframe >= 0 else len(keyframes)
             if row < len(keyframes) and keyframes[row] == keyframe:
                 if last >= 0 and since is not None:
