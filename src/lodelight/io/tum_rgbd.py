@@ -65,7 +65,10 @@ def _built_in_rig(path: Path) -> Rig:
     camera = Camera.create("radtan", 640, 480, *LENSES[found[1]])
     row_time_s = 0.0 if found[1] == "3" else KINECT_ROW_TIME_S  # the third was an Asus Xtion
     depth = DepthSpec(camera, SE3.identity(), units_per_m=UNITS_PER_M)
-    return Rig((CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s),), depth=depth)
+    # The driver, ROS's openni_camera, stamps an image when it has arrived, which is after its last row was read.
+    late_s = row_time_s * camera.height
+    colour = CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s, time_offset_s=-late_s)
+    return Rig((colour,), depth=depth)
 
 
 def _comment_files(path: Path) -> list[str]:
