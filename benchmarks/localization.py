@@ -52,7 +52,7 @@ class Query:
     """Frames through a localizer: estimates, and CPU ms of each."""
 
     def __init__(self, rig, map: Map, frames: Any, given: argparse.Namespace) -> None:
-        config = LocalizerConfig(sensors="mono", temporary_points=not given.no_temporary_points)
+        config = LocalizerConfig(sensors=given.sensors, temporary_points=not given.no_temporary_points)
         self.events: list[dict[str, Any]] = []
         self.localizer = Localizer(
             rig, map, with_settings(config, given.set),
@@ -166,7 +166,7 @@ def pair(given: argparse.Namespace) -> None:
     query = open_source(given.query)
     if given.gaps_m:
         make_gaps(map, given.gaps_m)
-    rig, frames = shrunk(query.rig, query.messages("mono", end_s=given.end), given.scale)
+    rig, frames = shrunk(query.rig, query.messages(given.sensors, end_s=given.end), given.scale)
     run = Query(rig, map, frames, given)
     print(f"{query.name} in {given.run}, {len(map.alive_keyframes)} keyframes: {run.told()}")
     off, turn, status = run.errors(T_map_truth, query.ground_truth())
@@ -192,9 +192,8 @@ def shrunk(rig, frames, scale: float):
     params[2:4] = (params[2:4] + 0.5) * scale - 0.5
     lens = replace(camera, width=size[0], height=size[1], params=params)
     small = (
-        Frame(f.t_ns, (cv2.resize(f.images[0], size, interpolation=cv2.INTER_AREA),))
+        Frame(f.t_ns, (cv2.resize(f.images[0], size, interpolation=cv2.INTER_AREA),)) if isinstance(f, Frame) else f
         for f in frames
-        if isinstance(f, Frame)
     )
     return replace(rig, cameras=(replace(rig.cameras[0], camera=lens),)), small
 
@@ -331,6 +330,7 @@ def main() -> None:
             parser.add_argument(recording, type=Path)
         parser.add_argument("--set", action="append", default=[], help="a setting of the localizer")
         parser.add_argument("--no-temporary-points", action="store_true")
+        parser.add_argument("--sensors", choices=["mono", "mono-inertial"], default="mono", help="of the query")
         parser.add_argument("--verbose", action="store_true")
         parser.set_defaults(work=work)
         return parser

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lodelight.compiled import Stopwatch
-from lodelight.errors import ConfigError, MapError
+from lodelight.errors import CalibrationError, MapError
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3, carried_covariance
@@ -17,11 +17,12 @@ from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording
 from lodelight.localization.follower import n_temporary
 from lodelight.localization.ladder import EventSink, Ladder, LadderConfig
+from lodelight.localization.reckoning import DeadReckoning
 from lodelight.localization.relocalize import Hint
 from lodelight.localization.states import State
 from lodelight.localization.tracker import Tracked
 from lodelight.mapping.map import Map
-from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message
+from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu, LightFix, Message
 from lodelight.rig import Rig
 from lodelight.types import Array
 
@@ -33,7 +34,8 @@ GUESSED = 0.5  # of the way without anything whose distance is known
 class LocalizerConfig:
     """Every default of the system, by stage.
 
-    sensors : mono, stereo or rgbd; temporary_points : whether they may carry the camera where the map is not enough
+    sensors : mono, stereo or rgbd, each also with -inertial
+    temporary_points : whether they may carry the camera where the map is not enough
     hint_reach_m : from how far away the place of a hinted pose may be seen
     """
 
@@ -52,7 +54,7 @@ class Localizer:
     rig : of the camera, which need not be the one that made the map; its first camera is used
     on_event : told of what happens, as on_event(t_ns, kind, **fields)
     Poses are T_world_body in the map's frame, of the body of `rig`.
-    Raises MapError where the map has nothing to localize in, ConfigError on sensors that are unknown.
+    Raises MapError where the map has nothing to localize in, CalibrationError on sensors that the rig lacks.
     """
 
     def __init__(
@@ -64,14 +66,17 @@ class Localizer:
         live: bool = False,
     ) -> None:
         self.config = config or LocalizerConfig()
-        _check(map, self.config.sensors)
+        _check(map)
+        visual, _, inertial = self.config.sensors.partition("-")
+        if inertial and rig.imu is None:
+            raise CalibrationError(f"{self.config.sensors} was asked for, but the rig has no IMU; give it [imu]")
         self.map = map
         self.live = live
         self.on_event = on_event
-        self.front_end = FrontEnd(rig, self.config.sensors, self.config.orb)
+        self.front_end = FrontEnd(rig, visual, self.config.orb)
         self.ladder = Ladder(
             rig, map, self.config.orb, self.config.ladder, self.config.seed, self.config.temporary_points, live,
-            self._emit,
+            self._emit, DeadReckoning(rig.imu, self._emit) if inertial and rig.imu is not None else None,
         )  # fmt: skip
         self.relocalizations = 0
         self.dropped = 0
@@ -93,7 +98,11 @@ class Localizer:
             if message.T_world_body is not None:
                 self.hint(message.t_ns, message.T_world_body, message.covariance)
             return None
-        return self.step(message) if isinstance(message, Frame) else None
+        if isinstance(message, Imu):
+            if self.ladder.reckoning is not None:
+                self.ladder.reckoning.add(message)
+            return None
+        return self.step(message)
 
     def hint(self, t_ns: int, T_world_body: SE3, covariance: Array) -> None:
         """Where the body was by something else, a light fix or a tag: a lost camera is looked for there for 2 s.
@@ -158,9 +167,7 @@ class Localizer:
         return total
 
 
-def _check(map: Map, sensors: str) -> None:
-    if sensors.endswith("-inertial"):
-        raise ConfigError(f"{sensors}: localization does not use the IMU; choose {sensors.removesuffix('-inertial')}")
+def _check(map: Map) -> None:
     if len(map.alive_keyframes) == 0 or len(map.alive_points) == 0:
         raise MapError("the map is empty: it has no keyframe with points; map the building first, with lodelight run")
     if not map.features.desc.any() or not map.points.desc[map.alive_points].any():

@@ -25,7 +25,7 @@ def localize(
     source: Path = typer.Argument(..., help="Recording, folder of images, video, or a single image."),
     map_file: Path = typer.Option(..., "--map", help="Map file (map.lode) or the out folder of a run; only read."),
     out: Path = typer.Option(..., help="Folder for trajectory and report; created."),
-    sensors: str = typer.Option("", help="mono, stereo or rgbd; default: the most the source has."),
+    sensors: str = typer.Option("", help="mono, stereo or rgbd, also with -inertial; default: all the source has."),
     temporary_points: bool = typer.Option(
         True, "--temporary-points/--no-temporary-points", help="Carry the camera where the map is not enough."
     ),
@@ -56,7 +56,7 @@ def localize(
     if out.resolve() == map_file.resolve().parent:
         raise ConfigError(f"--out {out} holds the run that made the map; choose another folder")
     wanted = LocalizerConfig(
-        sensors=sensors or recording.rig.sensors.removesuffix("-inertial"),
+        sensors=sensors or recording.rig.sensors,
         seed=seed,
         temporary_points=temporary_points,
     )

@@ -19,6 +19,7 @@ from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.localization.influence import MOST, leverage
 from lodelight.localization.motion import Motion
+from lodelight.localization.reckoning import Reckoned
 from lodelight.localization.temporary import TemporaryPoints
 from lodelight.localization.tracker import INLIERS, MAJORITY, NARROW, Landmarks, Tracked, Tracker, TrackerConfig
 from lodelight.mapping.map import Map
@@ -35,7 +36,11 @@ NEAR_M, NEAR_DEG, NEAREST = 8.0, 60.0, 20  # else keyframes from so near, turned
 
 
 class Follower(Tracker):
-    """A tracker that leaves the map as it is. temporary : the overlay, empty while the map is enough"""
+    """A tracker that leaves the map as it is.
+
+    temporary : the overlay, empty while the map is enough
+    reckoned : where the body is in the next frame by its IMU, None without one
+    """
 
     def __init__(
         self,
@@ -48,6 +53,18 @@ class Follower(Tracker):
     ) -> None:
         super().__init__(rig, map, orb, config, seed)
         self.temporary = temporary
+        self.reckoned: Reckoned | None = None
+
+    def track(self, t_ns: int, seen: Features) -> Tracked:
+        """As `Tracker.track`; where an IMU says where the camera should be, around there."""
+        last, reckoned = self.last, self.reckoned
+        if reckoned is None or last is None or t_ns <= last.t_ns:
+            return super().track(t_ns, seen)
+        dt_s = (t_ns - last.t_ns) * 1e-9
+        moved = self._moved_with_map(last).inverse() @ reckoned.T_map_body
+        self._motion = Motion(moved.log() / dt_s, reckoned.covariance / dt_s**2)
+        tracked = super().track(t_ns, seen)
+        return self.track_at(t_ns, seen, reckoned.T_map_body) if tracked.why_lost else tracked
 
     def forget(self) -> None:
         """The camera may be anywhere now."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeGuard
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.localization.beside import InlineSearch, ThreadedSearch
 from lodelight.localization.follower import Follower, n_temporary
 from lodelight.localization.machine import Found
+from lodelight.localization.reckoning import DeadReckoning, Reckoned
 from lodelight.localization.relocalize import Hint, Relocalizer, RelocalizerConfig
 from lodelight.localization.states import State, States, StatesConfig, Step
 from lodelight.localization.temporary import TemporaryConfig, TemporaryPoints
@@ -28,6 +30,7 @@ from lodelight.rig import Rig
 from lodelight.types import Ints
 
 HINT_S = 2.0  # after which nothing is left of what was known of a place
+TIPPED_DEG = 30.0  # off the vertical: an accelerometer that shakes is off by less
 
 EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
 
@@ -43,6 +46,7 @@ class SecondLookConfig:
     near_m, near_deg, drift : how far the carried pose may be off, at once and as a share of the way without the map
     reach_m : from how far a place may be seen
     gain : a search beside is worth leaving for where it finds so many times the points that tracking has
+    reckoned_m : standard deviation of a pose by the IMU alone up to which it is one
     """
 
     inliers: int = 50
@@ -55,6 +59,7 @@ class SecondLookConfig:
     reach_m: float = 3.0
     drift: float = 0.05
     gain: float = 1.5
+    reckoned_m: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -84,15 +89,17 @@ class Ladder:
 
     carrying : whether temporary points may be used; live : the search beside on its own thread
     emit : told of what happens, as emit(t_ns, kind, **fields)
+    reckoning : by the rig's IMU, None without one; its samples are added to it before the frames
     status, why : of the last frame, in the words of `Estimate`
     confirmed : (t_ns, T_world_body) of frames that were believed only after later ones had agreed
     """
 
     def __init__(
         self, rig: Rig, map: Map, orb: OrbConfig, config: LadderConfig, seed: int, carrying: bool, live: bool,
-        emit: EventSink,
+        emit: EventSink, reckoning: DeadReckoning | None = None,
     ) -> None:  # fmt: skip
         self.map = map
+        self.reckoning = reckoning
         self.config = config
         self.emit = emit
         self.temporary = TemporaryPoints(rig.cameras[0], orb, config.temporary, config.tracking.sigma_px)
@@ -113,8 +120,15 @@ class Ladder:
 
     def locate(self, t_ns: int, seen: Features) -> Tracked:
         """Pose of a frame in the map; `status` and `why` say how it was had, or why not."""
+        reckoned = self.follower.reckoned = self.reckoning.predict(t_ns) if self.reckoning is not None else None
         tracked = self._follow(t_ns, seen) if self.states.state is not State.searching else None
-        return tracked if tracked is not None else self._search(t_ns, seen)
+        if tracked is None:
+            tracked = self._search(t_ns, seen)
+        if tracked.why_lost and self._is_known(reckoned):
+            return self._reckoned(reckoned, tracked)
+        if self.reckoning is not None and not tracked.why_lost:
+            self.reckoning.correct(t_ns, tracked.T_world_body, tracked.covariance)
+        return tracked
 
     def close(self) -> None:
         """Wait for the search beside, and forget what is temporary."""
@@ -138,7 +152,8 @@ class Ladder:
         tracked = self.follower.track(t_ns, seen)
         in_map, in_all = (0, 0) if tracked.why_lost else (tracked.right_in_map, tracked.right_in_all)
         moved_m = float(np.linalg.norm(tracked.T_world_body.t - last.T_world_body.t))
-        step = self.states.judge(t_ns, in_map, in_all, moved_m, tracked.measured)
+        known = self._is_known(self.follower.reckoned)
+        step = self.states.judge(t_ns, in_map, in_all, moved_m, tracked.measured, known)
         if step is Step.lost:
             self._give_up(t_ns)
             return None
@@ -196,6 +211,21 @@ class Ladder:
             self._end_carrying(t_ns, self.states.why)
         self.follower.forget()
         self.temporary.forget_past()
+
+    # -- by the IMU alone ---------------------------------------------------------------------------------------
+
+    def _is_known(self, reckoned: Reckoned | None) -> TypeGuard[Reckoned]:
+        """Whether the IMU alone says well enough where a camera is that was followed until now."""
+        following = self.states.state is not State.searching
+        return reckoned is not None and following and reckoned.sigma_m <= self.config.second_look.reckoned_m
+
+    def _reckoned(self, reckoned: Reckoned, tracked: Tracked) -> Tracked:
+        """A frame that shows too little, where the IMU says."""
+        self.status, self.why = "degraded", f"by the IMU alone: {tracked.why_lost}"
+        return replace(
+            tracked, T_world_body=reckoned.T_map_body, covariance=reckoned.covariance, why_lost="",
+            reference=self.follower.last.reference if self.follower.last is not None else 0,
+        )  # fmt: skip
 
     # -- the search beside --------------------------------------------------------------------------------------
 
@@ -267,6 +297,9 @@ class Ladder:
         tracked = self._by_map_alone(asked, found.T_world_body, found.point)
         if tracked.why_lost or tracked.right_in_map < self.config.states.min_inliers:
             return self._nowhere(t_ns, seen, f"{found.why}, but {tracked.right_in_map} on a second look")
+        tipped_deg = self.reckoning.tipped_deg(t_ns, tracked.T_world_body) if self.reckoning is not None else 0.0
+        if tipped_deg > TIPPED_DEG:
+            return self._nowhere(t_ns, seen, f"{found.why}, but {tipped_deg:.0f} degrees off the vertical")
         waiting: list[Tracked] = []
         if tracked.right_in_map < look.inliers:
             if not self._pending or not self._explained(self._pending[-1], tracked):
@@ -288,11 +321,13 @@ class Ladder:
         return self.relocalizer.find(seen)
 
     def _last_known(self) -> tuple[int, Hint] | None:
-        """Where the camera was last."""
-        last = self.follower.last
+        """Where the camera was last, or is by its IMU."""
+        last, reckoned, reach_m = self.follower.last, self.follower.reckoned, self.config.second_look.reach_m
+        if reckoned is not None and reckoned.sigma_m < reach_m:
+            return reckoned.t_ns, Hint(reckoned.T_map_body, reach_m, reckoned.covariance)
         if last is None:
             return self._known
-        return last.t_ns, Hint(last.T_world_body, self.config.second_look.reach_m)
+        return last.t_ns, Hint(last.T_world_body, reach_m)
 
     def _explained(self, before: Tracked, now: Tracked) -> bool:
         """Whether a camera can have moved from one answer to the next, in the time it had."""

@@ -71,6 +71,7 @@ class States:
         self.weak = 0  # frames in a row without a pose that can be believed
         self.carried_m = 0.0  # since the map last held the pose, if only just
         self.guessed_m = 0.0  # of it, without enough points whose distance is known
+        self._reckoned = False
         self._found_ns = 0
         self._held_ns = 0  # when the map last held the pose, if only just
 
@@ -80,12 +81,16 @@ class States:
         self.poor = self.weak = 0
         self._found_ns = t_ns
 
-    def judge(self, t_ns: int, in_map: int, in_all: int, moved_m: float, measured: int | None = None) -> Step:
+    def judge(
+        self, t_ns: int, in_map: int, in_all: int, moved_m: float, measured: int | None = None, reckoned: bool = False
+    ) -> Step:
         """What follows from a frame.
 
         in_map, in_all : points of the map, and of both kinds, that agree with its pose; moved_m : since the last frame
         measured : those of both kinds whose distance is known, all where None
+        reckoned : an IMU says well where the camera is, so that frames may fail in any number
         """
+        self._reckoned = reckoned
         if self.state is State.carried:
             return self._carried(t_ns, in_map, in_all, moved_m, in_all if measured is None else measured)
         c = self.config
@@ -132,7 +137,7 @@ class States:
 
     def _unsure(self, why: str) -> Step:
         self.weak += 1
-        if self.weak >= self.config.patience:
+        if self.weak >= self.config.patience and not self._reckoned:
             return self._lost(why)
         self.why = why
         return Step.unsure
