@@ -7,6 +7,7 @@ for one of the map's. A finished `Tracked` has the two kinds apart.
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import numpy as np
@@ -30,7 +31,7 @@ from lodelight.types import Array, Bools, Ints
 FIRST_TEMPORARY = -2
 ENOUGH_VOTES = 30  # matches with the map, from which its own covisibility says best what is around
 NOISES = (1.0, 1.4, 2.0)  # of a frame over a sharp one's, at which right matches are told from wrong ones
-ENOUGH_MEASURED = 30  # points whose distance is known, which do without the others
+ENOUGH_MEASURED, OPEN_M = 10, 0.03  # points whose distance is known do without others if so many, and so exact
 MOST_DECIDING = 5  # points that decide a pose alone, in one frame
 NEAR_M, NEAR_DEG, NEAREST = 8.0, 60.0, 20  # else keyframes from so near, turned by so little, at most so many
 
@@ -109,7 +110,7 @@ class Follower(Tracker):
         if tracked.right_in_map < MAJORITY * tracked.n_inliers and np.any(carried >= 0):  # by chance, for the most part
             mapped = np.full(len(seen), -1, np.int32)
             tracked = posed(mapped, carried)
-        if tracked.measured < ENOUGH_MEASURED and np.any(carried >= 0):
+        if np.any(carried >= 0) and _is_open(tracked):
             tracked = posed(mapped, carried, guess=True)
         if use_overlay:
             assert tracked.temporary is not None
@@ -150,7 +151,7 @@ class Follower(Tracker):
         why = f"{in_all} of {len(used)} matches with the local map agree beyond chance"
         return Tracked(
             t_ns, seen, solved.T_world_body, solved.covariance, point, reference, noise, temporary=temporary,
-            right_in_map=in_map, right_in_all=in_all, measured=measured,
+            right_in_map=in_map, right_in_all=in_all, measured=measured, guessed=guess,
             why_lost=why if in_all < self.config.min_inliers else "",
         )  # fmt: skip
 
@@ -216,6 +217,12 @@ class Follower(Tracker):
             np.append(known.octave, seen.octave),
             np.append(known.angle, seen.angle),
         )
+
+
+def _is_open(tracked: Tracked) -> bool:
+    """Whether the points whose distance is known leave open where the camera is."""
+    sigma_m = math.sqrt(np.linalg.eigvalsh(tracked.covariance[3:, 3:])[-1])
+    return tracked.measured < ENOUGH_MEASURED or sigma_m > OPEN_M
 
 
 def _right(chi2: Array, inliers: Bools, window: float) -> int:

@@ -153,7 +153,7 @@ class Ladder:
         in_map, in_all = (0, 0) if tracked.why_lost else (tracked.right_in_map, tracked.right_in_all)
         moved_m = float(np.linalg.norm(tracked.T_world_body.t - last.T_world_body.t))
         known = self._is_known(self.follower.reckoned)
-        step = self.states.judge(t_ns, in_map, in_all, moved_m, tracked.measured, known)
+        step = self.states.judge(t_ns, in_map, in_all, moved_m, tracked.guessed, known)
         if step is Step.lost:
             self._give_up(t_ns)
             return None
@@ -165,10 +165,8 @@ class Ladder:
             self.emit(t_ns, "carried", begins=True, why=self.states.why)
         well = tracked.right_in_map >= self.config.states.good_inliers
         if self.states.state is State.carried:
-            self.temporary.grow(
-                tracked, self.follower.distances(tracked), tracked.measured >= self.config.states.min_inliers
-            )
-            if self.temporary.remember(tracked, well):
+            self.temporary.grow(tracked, self.follower.distances(tracked))
+            if not tracked.guessed and self.temporary.remember(tracked, well):
                 adjust_window(self.temporary, self.map, tracked, self.config.tracking.sigma_px)
             tracked = self._look_beside(tracked)
         else:

@@ -56,7 +56,7 @@ class StatesConfig:
     after_found_s: float = 1.0
     max_carried_s: float = 60.0
     max_carried_m: float = 30.0
-    max_guessed_m: float = 1.0
+    max_guessed_m: float = 0.5
 
 
 class States:
@@ -82,17 +82,17 @@ class States:
         self._found_ns = t_ns
 
     def judge(
-        self, t_ns: int, in_map: int, in_all: int, moved_m: float, measured: int | None = None, reckoned: bool = False
+        self, t_ns: int, in_map: int, in_all: int, moved_m: float, guessed: bool = False, reckoned: bool = False
     ) -> Step:
         """What follows from a frame.
 
         in_map, in_all : points of the map, and of both kinds, that agree with its pose; moved_m : since the last frame
-        measured : those of both kinds whose distance is known, all where None
+        guessed : how far it moved is, for want of points whose distance is known
         reckoned : an IMU says well where the camera is, so that frames may fail in any number
         """
         self._reckoned = reckoned
         if self.state is State.carried:
-            return self._carried(t_ns, in_map, in_all, moved_m, in_all if measured is None else measured)
+            return self._carried(t_ns, in_map, in_all, moved_m, guessed)
         c = self.config
         self.poor = 0 if in_map >= c.good_inliers else self.poor + 1
         if in_map < c.min_inliers:
@@ -110,13 +110,13 @@ class States:
         self.state, self.why = State.following, why
         self.poor = self.weak = 0
 
-    def _carried(self, t_ns: int, in_map: int, in_all: int, moved_m: float, measured: int) -> Step:
+    def _carried(self, t_ns: int, in_map: int, in_all: int, moved_m: float, guessed: bool) -> Step:
         c = self.config
         if in_map >= c.min_inliers:
             self._held_ns, self.carried_m, self.guessed_m = t_ns, 0.0, 0.0
         else:
             self.carried_m += moved_m
-            self.guessed_m += moved_m if measured < c.min_inliers else 0.0
+            self.guessed_m += moved_m if guessed else 0.0
         if in_map >= c.good_inliers:
             self.leave("")
             return Step.leave

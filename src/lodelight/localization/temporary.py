@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
@@ -28,6 +30,7 @@ SAME_SCALE = 1.8  # by how much sizes of a patch in two images may differ from w
 NEAR_M = 0.05  # of baseline, below which no pair of frames is tried
 VIEW_COSINE = 0.5  # of the angle between two views that may show the same
 SUPPOSED = 0.5  # of an inverse distance that is not measured, one standard deviation as a share of it
+AGREE = 0.95  # of right rays meet within this bound of their noise
 ENOUGH_DISTANCES = 10  # measured in a frame, to suppose others from
 
 
@@ -55,7 +58,10 @@ class TemporaryConfig:
 
 @dataclass(eq=False)
 class Past:
-    """An earlier frame; adjusting moves it. point, temporary : (N,) as in `Tracked`; well : the map alone held it"""
+    """An earlier frame whose pose was measured; adjusting moves it.
+
+    point, temporary : (N,) as in `Tracked`; well : the map alone held it
+    """
 
     seen: Features
     T_world_body: SE3
@@ -119,10 +125,7 @@ class TemporaryPoints:
             )
             if near and (self._past[-1].well or not well):
                 return False
-        temporary = _none(tracked.seen) if tracked.temporary is None else tracked.temporary.copy()
-        self._past.append(
-            Past(tracked.seen, tracked.T_world_body, tracked.point.copy(), temporary, tracked.noise, well)
-        )
+        self._past.append(self._past_of(tracked, well))
         return True
 
     def in_sight(self, T_world_body: SE3) -> Sight:
@@ -162,17 +165,18 @@ class TemporaryPoints:
 
     # -- how they are made --------------------------------------------------------------------------------------
 
-    def grow(self, tracked: Tracked, distance_m: Array, measured: bool) -> int:
+    def grow(self, tracked: Tracked, distance_m: Array) -> int:
         """New points from what a frame sees and nothing explains yet; its `temporary` names them. Returns how many.
 
-        distance_m : (K,) of the points of the map that it sees; measured : whether where it was is, and not guessed:
-        points are as exact as the poses that they are had from
+        distance_m : (K,) of the points of the map that it sees
+        Nothing is measured from a pose that is guessed: points are as exact as the poses that they are had from.
         """
         if tracked.temporary is None:
             tracked.temporary = _none(tracked.seen)
         before = self.created
         self._from_depth(tracked)
-        for past in self._partners(tracked) if measured else ():
+        self._measure(self._past if tracked.guessed else [*self._past, self._past_of(tracked, False)])
+        for past in self._partners(tracked) if not tracked.guessed else ():
             known = np.count_nonzero((tracked.point >= 0) | self.measured(tracked.temporary))
             if known >= self.config.enough or len(self) >= self.config.most:
                 break
@@ -194,6 +198,37 @@ class TemporaryPoints:
             xyz = T_world_cam @ (seen.ray[rows] / (seen.ray[rows, 2] * seen.inv_depth[rows])[:, None])
             assert tracked.temporary is not None
             tracked.temporary[rows] = self._add(xyz, seen.take(rows), T_world_cam.t)
+
+    def _past_of(self, tracked: Tracked, well: bool) -> Past:
+        temporary = _none(tracked.seen) if tracked.temporary is None else tracked.temporary.copy()
+        return Past(tracked.seen, tracked.T_world_body, tracked.point.copy(), temporary, tracked.noise, well)
+
+    def _measure(self, frames: Iterable[Past]) -> None:
+        """Give the distance to points that are only supposed, by all frames that see them."""
+        ids, rays, centres, sigma = [], [], [], []
+        for past in frames:
+            rows = np.flatnonzero((self.alive(past.temporary) >= 0) & ~self.measured(past.temporary))
+            seen, T_world_cam = past.seen.take(rows), past.T_world_body @ self.spec.T_body_cam
+            ids.append(past.temporary[rows])
+            rays.append(seen.ray @ T_world_cam.R.T)
+            centres.append(np.broadcast_to(T_world_cam.t, (len(rows), 3)))
+            sigma.append(self._sigma_rad(seen, past.noise))
+        order = np.argsort(np.concatenate(ids), kind="stable")
+        named, start = np.unique(np.concatenate(ids)[order], return_index=True)
+        start = np.append(start, len(order))
+        made = triangulate_rays(
+            np.concatenate(centres)[order], np.concatenate(rays)[order], np.concatenate(sigma)[order], start
+        )
+        views = np.diff(start)
+        good = made.in_front & (made.chi2 < 2.0 * gammaincinv(np.maximum(views, 2) - 1.5, AGREE))
+        good &= made.parallax >= math.radians(NEVER_BELOW_DEG)
+        good &= made.relative_sigma < self.config.max_relative_sigma
+        t, ids = self.table, named[good]
+        nearer = np.linalg.norm(made.xyz[good] - t.centre[ids], axis=1)
+        nearer /= np.linalg.norm(t.xyz[ids] - t.centre[ids], axis=1)
+        t.d_min[ids] *= nearer
+        t.d_max[ids] *= nearer
+        t.xyz[ids], t.sigma_inv_distance[ids] = made.xyz[good], 0.0
 
     def _partners(self, tracked: Tracked) -> list[Past]:
         """Earlier frames to triangulate with, best first: those the map alone held, then the others; the newest first.

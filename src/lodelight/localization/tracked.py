@@ -36,6 +36,7 @@ class Tracked:
     temporary : (N,) temporary point of every feature, -1 = none; None where there are no such points
     right_in_map, right_in_all, measured : how many of the map's points agree beyond chance, of both kinds, and of both
         kinds those whose distance is known; -1 = not asked
+    guessed : those leave open where the camera is: points whose distance is supposed have a say
     """
 
     t_ns: int
@@ -51,6 +52,7 @@ class Tracked:
     right_in_map: int = -1
     right_in_all: int = -1
     measured: int = -1
+    guessed: bool = False
 
     @property
     def n_inliers(self) -> int:
