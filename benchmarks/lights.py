@@ -20,9 +20,18 @@ from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3
 from lodelight.lights.modulation import MIN_STRIPES, Pwm
 from lodelight.lights.odometry import LightOdometry
-from lodelight.lights.receiver import receiver
+from lodelight.lights.receiver import EDGE, receiver
 
 DIAMETERS = (20, 30, 40, 60, 80, 120)
+
+
+def lit_rows(diameter: float, bell: bool, level: float) -> float:
+    """Rows in which a face is at least a twentieth as bright as its brightest pixel: there the receiver sees stripes.
+
+    A disc's own diameter; a bell-shaped face, 1 / (1 + r^8), is wider than at half of its brightness.
+    """
+    floor = EDGE * min(1.0, 255.0 / level)
+    return diameter * (1.0 / floor - 1.0) ** 0.125 if bell else diameter
 
 
 def identities(count: int) -> None:
@@ -38,7 +47,7 @@ def identities(count: int) -> None:
                 ids = [s.id for s in reader.sightings(image, 0) if s.id]
                 named += bool(ids)
                 wrong += any(i != f"{frequency:.0f}" for i in ids)
-                if frequency * diameter * ROW_S < MIN_STRIPES:
+                if frequency * lit_rows(diameter, bell, level) * ROW_S < MIN_STRIPES:
                     below += 1
                     guessed += bool(ids)
             face = f"{'bell' if bell else 'even'}, peak {level:.0f} DN"

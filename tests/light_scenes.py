@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from lodelight.anchors import Light
@@ -30,23 +31,27 @@ LIGHTS = tuple(Light(f"{f:.0f}", f, np.array([0.1 * i, 0.0, 2.5])) for i, f in e
 
 
 def paint(shape, discs, rng, bell=False, level=180.0, psf_px=0.7, background=2.0):
-    """An image of discs (centre (2,), diameter px, modulation): sub-sampled rims, shot and read noise, eight bits."""
+    """An image of discs (centre (2,), diameter px, modulation): sub-sampled rims, shot and read noise, eight bits.
+
+    The lens blurs a face before its rows are exposed: blurred afterwards, stripes on a face that fades would shift.
+    """
     scene = np.full(shape, background)
     fine = 4
     rows_s = rng.uniform() + ROW_S * np.arange(shape[0])
     for centre, diameter, code in discs:
-        reach = int(0.5 * diameter * (2.4 if bell else 1.2)) + 3
+        reach = int(0.5 * diameter * (2.4 if bell else 1.2)) + 6
         x0, y0 = (max(0, int(c) - reach) for c in centre)
         x1, y1 = min(shape[1], int(centre[0]) + reach), min(shape[0], int(centre[1]) + reach)
         ax, ay = ((np.arange((b - a) * fine) + 0.5) / fine - 0.5 + a for a, b in ((x0, x1), (y0, y1)))
         r = np.hypot(ax[None] - centre[0], ay[:, None] - centre[1]) / (0.5 * diameter)
         face = 1.0 / (1.0 + r**8) if bell else (r < 1.0).astype(float)
         face = face.reshape(y1 - y0, fine, x1 - x0, fine).mean(axis=(1, 3))
+        face = cv2.GaussianBlur(face, (0, 0), psf_px) if psf_px > 0.0 else face
         lit = code.mean(rows_s[y0:y1], EXPOSURE_S) if code else np.ones(y1 - y0)
         scene[y0:y1, x0:x1] += level * face * lit[:, None]
     unit = Exposure(1.0 / 385.0)  # one grey level per unit of radiance
     shade = np.ones(shape, np.float32)
-    return develop(scene.astype(np.float32), shade, unit, int(rng.integers(1 << 40)), psf_px)
+    return develop(scene.astype(np.float32), shade, unit, int(rng.integers(1 << 40)), psf_px=0.0)
 
 
 def crop(rng, diameter, frequency_hz, bell=False, level=180.0):

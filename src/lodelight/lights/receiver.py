@@ -110,7 +110,10 @@ def receiver(spec: CameraSpec | None, lights: tuple[Light, ...], stripes: str = 
 
 
 def _stripe_rows(image: Bytes, region: Region) -> float:
-    """Height of a round light in rows, by its width: its top and bottom may lie in dark stripes, its sides do not."""
+    """Height of a round light in rows, by its width: its top and bottom may lie in dark stripes, its sides do not.
+
+    Down to a twentieth of its brightness: a face that fades shows stripes far outside of where it is half as bright.
+    """
     piece = image[region.top : region.bottom, region.left : region.right]
     brightest = piece.max(axis=0).astype(np.float64) - region.background_dn
     lit = np.flatnonzero(brightest > max(region.level_dn, EDGE * float(brightest.max())))
