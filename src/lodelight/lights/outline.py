@@ -107,7 +107,7 @@ def refine_outline(d: Array, state: Array) -> tuple[Array, float, bool]:
                 g[j] += w * J[j] * r[i]
                 for k in range(5):
                     H[j, k] += w * J[j] * J[k]
-        scale = max(1.4826 * np.median(np.abs(r)), 0.02)
+        scale = max(1.4826 * median_size(r), 0.02)
         variance = max(total / max(inside - 5.0, 1.0), 1e-4)
         shape = variance / SHAPE_SIGMA**2
         for j in (3, 4):
@@ -130,3 +130,21 @@ def refine_outline(d: Array, state: Array) -> tuple[Array, float, bool]:
         if moved < 1e-8 and turn > 1:
             break
     return out, math.sqrt(total / inside), True
+
+
+@kernel
+def median_size(r: Array) -> float:
+    """Median of |r| to a thousandth of the largest, by halving: sorting would cost seconds of compilation."""
+    low, high = 0.0, 0.0
+    for value in r:
+        high = max(high, abs(value))
+    for _ in range(10):
+        middle, below = 0.5 * (low + high), 0
+        for value in r:
+            if abs(value) < middle:
+                below += 1
+        if 2 * below < len(r):
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
