@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from lodelight.io.euroc_writer import (
     write_sensors,
     written_stamps,
 )
+from lodelight.io.rig_toml import write_rig
 from lodelight.messages import Frame, Imu
 from lodelight.rig import CameraSpec, DepthSpec, ImuSpec, Rig
 from recordings import write_euroc, write_sevenscenes, write_tum
@@ -163,6 +165,18 @@ def test_any_recording_survives_its_conversion_to_a_euroc_folder(tmp_path, make)
             assert np.array_equal(a.gyro, b.gyro)
             assert np.array_equal(a.accel, b.accel)
     assert np.allclose(copy.ground_truth().xyz, source.ground_truth().xyz, atol=1e-9)  # nine decimals
+
+
+def test_the_light_camera_comes_along_on_the_bodys_clock(tmp_path):
+    rig, _ = write_full(tmp_path / "full")
+    write_rig(tmp_path / "late.toml", replace(rig, lights=replace(rig.lights, time_offset_s=0.002)))
+    source = open_source(tmp_path / "full", tmp_path / "late.toml")
+    convert(source.path, tmp_path / "out", tmp_path / "late.toml", end_s=0.12)
+    copy = open_source(tmp_path / "out")
+    assert (copy.rig.lights.time_offset_s, copy.rig.lights.row_time_s) == (0.0, 18.9e-6)
+    for a, b in zip(source.light_frames(end_s=0.12), copy.light_frames(), strict=True):
+        assert a.t_ns == b.t_ns
+        assert np.array_equal(a.images[0], b.images[0])
 
 
 def test_the_command_converts_recordings_trajectories_and_rigs(tmp_path, capsys):

@@ -98,7 +98,7 @@ def write_recording(
     end_s: float = math.inf,
     progress: Progress = lambda frames, n: frames,
 ) -> None:
-    """An EuRoC folder with all cameras, depth registered to camera 0, IMU and truth of a recording.
+    """An EuRoC folder with all cameras, depth registered to camera 0, light camera, IMU and truth of a recording.
 
     Stamps go onto the body's clock, so that the time offsets of the written rig are 0.
     """
@@ -108,12 +108,17 @@ def write_recording(
     folders = write_sensors(root, rig, comment=f"{recording.name}, {recording.format}")
     names = [f"cam{i}" for i in range(len(rig.cameras))]
     frames = recording.frames(len(rig.cameras), rig.depth is not None, start_s, end_s)
+    lights = recording.light_frames(start_s, end_s) if rig.lights is not None else None
     with closing(frames):
         for frame in progress(frames, recording.n_frames):
             for name, image in zip(names, frame.images, strict=True):
                 append_image(folders[name], frame.t_ns, image)
             if rig.depth is not None and frame.depth is not None:
                 append_image(folders["depth0"], frame.t_ns, stored_depth(frame.depth, rig.depth))
+    if lights is not None:
+        with closing(lights):
+            for frame in lights:
+                append_image(folders["light0"], frame.t_ns, frame.images[0])
     if rig.imu is not None:
         _append_samples(folders["imu0"], recording.inertial(start_s, end_s))
     truth = recording.ground_truth()
@@ -126,7 +131,8 @@ def _written_rig(rig: Rig) -> Rig:
     depth = rig.depth
     if depth is not None:
         depth = replace(depth, camera=cameras[0].camera, T_body_depth=cameras[0].T_body_cam, registered=True)
-    return Rig(cameras, depth=depth, imu=replace(rig.imu, time_offset_s=0.0) if rig.imu else None)
+    imu = replace(rig.imu, time_offset_s=0.0) if rig.imu else None
+    return Rig(cameras, depth=depth, imu=imu, lights=replace(rig.lights, time_offset_s=0.0) if rig.lights else None)
 
 
 def _append_samples(folder: Path, samples: Iterator[Imu]) -> None:
