@@ -39,10 +39,10 @@ def walk(seconds=14.0):
 class Loop:
     """What Slam does with lights, for a body that is tracked without error in a map that lies elsewhere."""
 
-    def __init__(self, gate=None, lights=None, known=LIGHTS, seed=0):
+    def __init__(self, gate=None, lights=None, known=LIGHTS, seed=0, true=LIGHTS):
         self.truth, self.events, self.map = walk(), [], Map(RIG)
         self.map.add_keyframe(0, SE3.identity(), NOTHING)
-        self.fixes = along(self.truth, LIGHTS, SPEC, np.random.default_rng(seed), known=known)
+        self.fixes = along(self.truth, true, SPEC, np.random.default_rng(seed), known=known)
         self.anchor = LightAnchor(self.map, gate or GateConfig("lights"), lights or LightsConfig(), known, self.tell)
         self.map.set_pose(0, T_WORLD_MAP.inverse() @ self.truth.pose(0))
 
@@ -185,6 +185,22 @@ def test_one_light_at_a_time_abstains_and_says_so():
     loop.run(each=lambda t_ns: said.append(loop.anchor.ask(candidate(t_ns, SE3.identity()))))
     assert {v.verdict for v in said} == {"ABSTAIN"}
     assert any("one light only: its yaw is unknown" in v.why for v in said)
+
+
+def test_single_lights_passed_one_after_another_lay_the_map_down():
+    sparse = tuple(
+        Light(f"S{i}", 2000.0 + 200.0 * (i % 3), np.array([1.9 * i + 0.4, 0.3 * (-1) ** i, 2.6])) for i in range(5)
+    )
+    loop = Loop(known=sparse, true=sparse)
+    assert not any(fix.T_world_body for fix in loop.fixes)
+    loop.run()
+    (event,) = loop.of("world")
+    assert "S0, S1, S2" in event["why"]
+    off = loop.map.pose(0).inverse() @ loop.truth.pose(0)
+    assert np.linalg.norm(off.t) < 0.05  # half a degree of level, 1.7 m under the lights
+    assert loop.of("light_misplaced") == []
+    settled = loop.anchor.settled() @ loop.map.pose(0)  # by all five, once the run is over
+    assert np.linalg.norm(settled.t - loop.truth.pose(0).t) < 0.03
 
 
 def test_a_frame_that_is_carried_along_is_sent_where_the_lights_motion_leads():

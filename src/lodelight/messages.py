@@ -80,6 +80,8 @@ class LightFix:
     lights : ids, of the sightings used; rms_px : of the distances between seen and expected centres
     T_world_body None : abstained, `why` says it
     seen : every named sighting of the image, also those that no position came of
+    up_body (3,) : unit, the way up that it was levelled by, and the sigma of that about either horizontal axis; None
+        where that is not known
     """
 
     t_ns: int
@@ -89,6 +91,8 @@ class LightFix:
     rms_px: float = 0.0
     why: str = ""
     seen: tuple[LightSighting, ...] = ()
+    up_body: Array | None = None
+    sigma_up_rad: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,6 +166,9 @@ class Slam:
             )
             if not with_imu:
                 adjust(self.map, self.map.alive_keyframes, orb, sigma_px, iterations, None)
+        move = self.lights.settled() if self.lights else None
+        if move is not None:
+            self.map.move(move)
         self.tags.finish()
 
     def feed(self, message: Message) -> Estimate | None:

@@ -16,7 +16,7 @@ from lodelight.types import Array
 MAX_RESIDUAL = 0.5  # of the profile's variance; more is no PWM
 APART_SIGMA = 5.0  # by which the second nearest code must be farther off than the nearest
 TOLERANCE = 0.01  # of the frequency: oscillators and the row time
-ENVELOPE_SHARE = 0.005  # of 1 / (the time a light takes to be read): errors measured on bell-shaped faces
+ENVELOPE_SHARE = 0.005  # of 1 / (the time a light takes to be read): real faces are not quite round or even
 LEAST_CORRELATION = 0.7
 LEAST_MARGIN = 0.1  # of the best word's correlation over the second's
 

@@ -58,13 +58,17 @@ class LightOdometry:
 
         Raises CalibrationError where the lights' map fits only when mirrored.
         """
+        up_body = np.array([0.0, 0.0, 1.0]) if up_body is None else up_body
+        self._sigma_tilt_rad = math.hypot(math.radians(self.sigma_tilt_deg), sigma_up_rad)
+        return replace(self._located(sightings, up_body), up_body=up_body, sigma_up_rad=self._sigma_tilt_rad)
+
+    def _located(self, sightings: Sequence[LightSighting], up_body: Array) -> LightFix:
         seen = [s for s in sightings if s.candidates]
         t_ns = round(float(np.mean([s.t_ns - sightings[0].t_ns for s in seen]))) + sightings[0].t_ns if seen else 0
         if len(seen) < 2:
             return LightFix(t_ns, None, np.full((6, 6), np.inf), tuple(s.candidates[0] for s in seen if s.id), 0.0,
                             "no light named" if not seen else "one light only: its yaw is unknown")  # fmt: skip
-        up_cam = self.spec.T_body_cam.R.T @ (np.array([0.0, 0.0, 1.0]) if up_body is None else up_body)
-        self._sigma_tilt_rad = math.hypot(math.radians(self.sigma_tilt_deg), sigma_up_rad)
+        up_cam = self.spec.T_body_cam.R.T @ up_body
         solution, views, why = self._assigned(seen, t_ns, up_cam)
         if solution is None:
             named = [s.id for s in seen if s.id is not None]

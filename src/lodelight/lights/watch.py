@@ -9,6 +9,7 @@ import numpy as np
 
 from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3
+from lodelight.lights.rays import meeting
 from lodelight.types import Array
 
 OFF_M = (
@@ -17,9 +18,7 @@ OFF_M = (
 NEAR_M = 0.15  # one nearer than this is where it should be
 WITNESSES, RECENT_S = 2, 3.0  # other lights, seen lately, that must be in their places: else it is the map that is not
 COMPANY = 0.5  # of a light's error: one seen beside it that is off by the same, to within that share, blames the map
-RAYS, KEPT = 6, 40  # rays that a place is found from, and that are remembered
-PARALLAX = 0.01  # least eigenvalue of the mean of I - d d^T: rays that open by about 12 degrees
-SPREAD_M = 0.15  # rms distance of the place from its rays
+KEPT = 40  # rays that are remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +86,9 @@ class LightWatch:
         return abs(t_ns - self._rays[name][-1][0]) * 1e-9
 
     def _place(self, name: str, since_ns: int | None = None) -> Array | None:
-        """(3,) where a light's rays meet; None where they are few, nearly parallel, or do not meet."""
+        """(3,) where a light's rays meet, or None."""
         rays = [(c, d) for t_ns, c, d in self._rays[name] if since_ns is None or t_ns >= since_ns]
-        if len(rays) < RAYS:
-            return None
-        centres, directions = np.array([c for c, _ in rays]), np.array([d for _, d in rays])
-        across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-        normal = across.mean(axis=0)
-        if np.linalg.eigvalsh(normal)[0] < PARALLAX:
-            return None
-        xyz: Array = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres) / len(rays))
-        off = np.einsum("nij,nj->ni", across, xyz - centres)
-        return xyz if np.sqrt((off**2).sum(axis=1).mean()) < SPREAD_M else None
+        return meeting(np.array([c for c, _ in rays]), np.array([d for _, d in rays]))
 
     def _across_m(self, name: str, xyz: Array) -> float:
         """How far a place is from the light's survey, across the mean ray."""

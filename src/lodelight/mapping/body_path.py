@@ -33,6 +33,11 @@ class BodyPath:
         """A localized frame, by rising stamp."""
         self._nodes.append(node)
 
+    @property
+    def last_ns(self) -> int | None:
+        """Of the last localized frame."""
+        return self._nodes[-1].t_ns if self._nodes else None
+
     def pose(self, node: Node) -> SE3:
         """T_map_body, as the map stands now."""
         return self._map.pose(node.reference) @ node.T_reference_body

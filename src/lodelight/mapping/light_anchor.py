@@ -53,7 +53,7 @@ class LightAnchor:
         self._waiting: deque[LightFix] = deque(maxlen=WAITING)
         self._unread: deque[LightFix] = deque(maxlen=WAITING)
         self._path = BodyPath(map)
-        self._placement = Placement(self._path, len(self._lights))
+        self._placement = Placement(self._path, self._lights, self.spec)
         self._ties = LightTies(map, self._path, lights, self._lights, emit)
         self._clock = ClockCheck()
         self._continuity = Continuity()
@@ -105,6 +105,9 @@ class LightAnchor:
             usable = not any(name in self._ties.watch.misplaced for name in fix.lights)
             if node is not None and fix.T_world_body is not None and usable and not self._held_at(fix.t_ns):
                 self._meet(fix, fix.T_world_body, node)
+            move = self._placement.see(fix, node) if not self._off_clock and not self._held_at(fix.t_ns) else None
+            if move is not None:
+                self._place(fix.t_ns, move)
             self._unread.append(fix)
         if self.aligned and not self._off_clock and self._pending is None:
             while self._unread:  # also those from before the map was laid down
@@ -115,6 +118,15 @@ class LightAnchor:
         """T_world_map by which the map is to be moved now, once."""
         move, self._pending = self._pending, None
         return move
+
+    def settled(self) -> SE3 | None:
+        """T_world_map by which the finished map is to be moved: every light that was passed has its say."""
+        if self.config.use == "tight" or self._off_clock:
+            return None  # they had it in every adjustment, or must not have it
+        move = self._placement.settle(self._ties.watch.misplaced)
+        if move is not None and self._path.last_ns is not None:
+            self._say(self._path.last_ns, move)
+        return None if move is None else move.T_world_map
 
     # -- what is asked ------------------------------------------------------------------------------------------
 
@@ -229,6 +241,9 @@ class LightAnchor:
         self._ties.watch.forget()
         self._continuity.forget()
         self._ties.forget()
+        self._say(t_ns, move)
+
+    def _say(self, t_ns: int, move: Move) -> None:
         moved = {
             "moved_m": float(np.linalg.norm(move.T_world_map.t)),
             "turned_deg": math.degrees(move.T_world_map.angle),

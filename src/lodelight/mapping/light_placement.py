@@ -1,20 +1,26 @@
-"""Where a map lies in the world, as more and more poses by the lights say it."""
+"""Where a map lies in the world, as more and more poses by the lights say it, and single lights where none do."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from lodelight.anchors import Light
 from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.lights.alignment import Pair, agreement, align
+from lodelight.lights.rays import lay_down, settle
 from lodelight.mapping.body_path import BodyPath, Node
+from lodelight.mapping.light_rays import LightRays
 from lodelight.messages import LightFix
+from lodelight.rig import CameraSpec
 from lodelight.types import Array
 
 PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
 ALIGN_LIGHTS = 3  # that those pairs must have seen: two that were swapped agree with themselves
+LATEST = 8  # lights, by which alone a map is laid down
 CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
 
 
@@ -29,14 +35,16 @@ class Move:
 
 
 class Placement:
-    """Of one map, in a building of so many surveyed lights.
+    """Of one map, in a building of surveyed lights; spec : of the light camera, None where only poses come.
 
     placed : it has a place in the world, if only by one fix; aligned : for good
     """
 
-    def __init__(self, path: BodyPath, surveyed: int) -> None:
-        self._fewest = min(ALIGN_LIGHTS, surveyed)
+    def __init__(self, path: BodyPath, lights: Mapping[str, Light], spec: CameraSpec | None) -> None:
+        self._fewest = min(ALIGN_LIGHTS, len(lights))
         self._path = path
+        self._lights = lights
+        self._rays = LightRays(path, spec)
         self._met: list[tuple[LightFix, SE3, Node]] = []
         self._laid: tuple[int, SE3, Array] | None = None  # when, by which pose of the body, and its covariance
         self.placed = False
@@ -62,6 +70,27 @@ class Placement:
             self.placed = True
             return Move(T_world_body @ self._path.pose(node).inverse(), "seeded by the first fix", 1)
         return self._review() if not self.aligned or len(self._met) % ALIGN_PAIRS == 0 else None
+
+    def see(self, fix: LightFix, node: Node | None) -> Move | None:
+        """What one image showed, be it a single light: three of them, passed one after another, lay the map down."""
+        if not self._rays.see(fix, node) or self.aligned:
+            return None
+        laid = lay_down(self._rays.tracks()[-LATEST:], self._lights, *self._rays.up())
+        if laid is None:
+            return None
+        self.placed = self.aligned = True
+        self.no_fit = ""
+        self._laid = fix.t_ns, laid.T_world_map, laid.covariance
+        return Move(laid.T_world_map, f"the rays to {', '.join(laid.lights)} meet where they hang", len(laid.lights))
+
+    def settle(self, without: Mapping[str, object]) -> Move | None:
+        """By all lights that were passed, but for those; where poses by them alone were tipped, this is not."""
+        lights = {name: light for name, light in self._lights.items() if name not in without}
+        tracks = self._rays.tracks()
+        laid = settle(SE3.identity(), tracks, lights, *self._rays.up()) if self.aligned and tracks else None
+        return (
+            None if laid is None else Move(laid.T_world_map, f"by the rays to {len(laid.lights)} lights", len(tracks))
+        )
 
     def _review(self) -> Move | None:
         """Align with what most pairs say: once for good, and again only where they contradict what was believed."""
