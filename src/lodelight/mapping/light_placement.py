@@ -20,6 +20,7 @@ from lodelight.types import Array
 PAIRS, PAIR_M = 400, 0.05  # pairs kept; how far the body moves between two of them
 ALIGN_PAIRS, ALIGN_M, ALIGN_SHARE = 10, 0.5, 0.6  # pairs, the ground they cover, and the share of them that must agree
 ALIGN_LIGHTS = 3  # that those pairs must have seen: two that were swapped agree with themselves
+CHI2_6_99 = 16.81
 LATEST = 8  # lights, by which alone a map is laid down
 CORRELATED_S = 5.0  # for which fixes share their largest error, that of up: together they are worth one
 
@@ -98,7 +99,10 @@ class Placement:
         ground_m = float(np.linalg.norm(np.ptp([pair.T_map_body.t for pair in pairs], axis=0)))
         if len(pairs) < ALIGN_PAIRS or ground_m < ALIGN_M:
             return None
-        now = int(np.count_nonzero(agreement(pairs, SE3.identity())))
+        agrees = agreement(pairs, SE3.identity())
+        if self.aligned:  # what a fix's own error explains, up above all, contradicts nothing
+            agrees |= np.array([self._explained(fix, pair) for (fix, _, _), pair in zip(self._met, pairs, strict=True)])
+        now = int(np.count_nonzero(agrees))
         if self.aligned and now >= 0.5 * len(pairs):
             return None
         found = align(pairs)
@@ -114,3 +118,9 @@ class Placement:
         last, T_world_body, _ = used[-1]
         self._laid = last.t_ns, T_world_body, np.mean([fix.covariance for fix, _, _ in used], axis=0)
         return Move(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs), again)
+
+    def _explained(self, fix: LightFix, pair: Pair) -> bool:
+        off = pair.T_world_body.inverse() @ pair.T_map_body
+        e = np.concatenate([off.log()[:3], pair.T_map_body.t - pair.T_world_body.t])
+        laid = self.covariance(fix.t_ns, pair.T_map_body)
+        return bool(e @ np.linalg.solve(fix.covariance + laid + 1e-12 * np.eye(6), e) <= CHI2_6_99)
