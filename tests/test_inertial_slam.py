@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from conftest import shared_data
+from light_scenes import SPEC, along
+from lodelight.anchors import Anchors, Light
 from lodelight.evaluation.compare import compare
+from lodelight.geometry.se3 import SE3
 from lodelight.io.sources import open_source
+from lodelight.mapping.compact import compacted
 from lodelight.messages import Estimate
+from lodelight.settings import with_settings
 from lodelight.slam import Slam, SlamConfig
 
 END_S = 4.5
@@ -44,3 +51,59 @@ def test_the_map_is_upright_and_its_path_is_that_of_the_drone(flown):
     assert found.ate.rotation_deg < 2.5
     assert len(slam.map.alive_keyframes) >= 8
     assert len(slam.inertial.flown.entries) > len(slam.map.alive_keyframes)
+
+
+def test_in_its_own_map_it_is_found_again_and_stays_there_without_writing(flown):
+    first, _ = flown
+    recording, known = open_source(shared_data("euroc_mh05")), compacted(first.map)
+    before = [table.columns["R"].copy() for table in (known.keyframes, known.loops)], len(known.points)
+    slam = Slam(recording.rig, SlamConfig(sensors="mono-inertial", final_iterations=0), map=known)
+    slam.localization_only = True
+    found = [e for e in slam.run(recording, 1.5, END_S) if e.localized]
+    path = first.trajectory()
+    row = {int(t): i for i, t in enumerate(path.t_ns)}
+    apart_m = [np.linalg.norm(e.T_world_body.t - path.xyz[row[e.t_ns]]) for e in found if e.t_ns in row]
+    assert len(apart_m) > 15
+    assert np.sqrt(np.mean(np.square(apart_m))) < 0.05  # of a path of 4 m at 8 m from what is seen
+    assert slam.stats()["relocalizations"] == 1
+    assert len(known.points) == before[1]
+    for was, table in zip(before[0], (known.keyframes, known.loops), strict=True):
+        assert np.array_equal(was, table.columns["R"])
+
+
+def upright(up):
+    """(3, 3) R_body_cam of a camera that looks along a direction of the body."""
+    across = np.linalg.svd(up[None])[2][1:]
+    R = np.column_stack([across[0], np.cross(up, across[0]), up])
+    return R
+
+
+@pytest.mark.parametrize(("use", "within_m", "within_deg"), [("gate", 0.15, 1.5), ("tight", 0.05, 1.0)])
+def test_lights_lay_its_map_down_in_the_world(use, within_m, within_deg):
+    """Two metres, of which one camera knows the length to a tenth: the gate holds keyframes more loosely."""
+    recording = open_source(shared_data("euroc_mh05"))
+    truth = recording.ground_truth()
+    assert truth is not None
+    here = truth.rows((truth.t_ns > recording.span_ns[0]) & (truth.t_ns < recording.span_ns[0] + int(END_S * 1e9)))
+    above = here.xyz.mean(axis=0) + np.array([0.0, 0.0, 3.0])
+    lights = tuple(
+        Light(str(i), 2000.0 + 200.0 * i, above + np.array([1.5 * (i % 6) - 3.75, 1.5 * (i // 6) - 3.75, 0.0]))
+        for i in range(36)
+    )
+    spec = replace(SPEC, T_body_cam=SE3(upright(here.pose(len(here) // 2).R.T[:, 2]), np.zeros(3)))
+    rig = replace(recording.rig, lights=spec)
+    fixes = along(here, lights, spec, np.random.default_rng(0))
+    config = with_settings(
+        SlamConfig(sensors="mono-inertial"), ["gate.use=lights"] if use == "gate" else ["lights.use=tight"]
+    )
+    slam = Slam(rig, config, anchors=Anchors(lights=lights))
+    for _ in slam.run(recording, 0.0, END_S, fixes):
+        pass
+    in_world = compare(slam.trajectory(), truth, "none")
+    assert slam.lights.aligned
+    assert in_world.ate.rmse_m < within_m
+    assert in_world.ate.rotation_deg < within_deg
+    if use == "gate":
+        counts = slam.stats()["gate"]
+        assert counts["pass"] > 3
+        assert counts["veto"] == 0

@@ -7,7 +7,6 @@ right.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -20,9 +19,12 @@ from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.klt import Tracks
 from lodelight.features.matching import FeatureIndex
-from lodelight.geometry.se3 import SE3
+from lodelight.geometry.se3 import SE3, level
+from lodelight.localization.berth import Berth
 from lodelight.localization.machine import Finder
 from lodelight.localization.tracker import Tracked, Tracker
+from lodelight.mapping.keyframes import Candidate, Decision, Gate, gated
+from lodelight.mapping.light_anchor import LightAnchor
 from lodelight.mapping.local import LocalMapper
 from lodelight.mapping.map import Map
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu, TagSighting
@@ -35,6 +37,7 @@ NEAR_TRACK_PX = 1.5  # a corner so near a track is the same point
 DEPTH_SIGMA = 0.02  # least relative deviation of a depth that the window gives a corner
 SEARCH = 2.0  # window in which map points are looked for around the odometry's pose, of a corner's own scale
 MIN_MATCHES = 20  # of map points, below which they do not tell a keyframe's place in the map
+LOST_KEYFRAMES = 3  # not found where they should be in a map that is only read: look for the next one everywhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class NewKeyframe:
-    """A keyframe of the window that is to be one of the map; landmarks : of the window at the time."""
+    """A keyframe of the window that may become one of the map; landmarks : of the window at the time."""
 
     step: OdometryStep
     landmarks: Landmarks
@@ -67,8 +70,11 @@ class InertialFront:
     def __init__(
         self, odometry: InertialOdometry, map: Map, front_end: FrontEnd, tracker: Tracker, mapper: LocalMapper,
         find: Finder, emit: EventSink, see: Callable[[Frame], Sequence[TagSighting]] = lambda frame: (),
+        gates: tuple[Gate, ...] = (), lights: LightAnchor | None = None,
     ) -> None:  # fmt: skip
-        """see : finds the tags in a frame"""
+        """see : finds the tags in a frame; gates : that a keyframe of the window must pass to become one of the map
+        lights : told where the body is
+        """
         self.odometry = odometry
         self.map = map
         self.front_end = front_end
@@ -77,9 +83,13 @@ class InertialFront:
         self.find = find
         self.emit = emit
         self.see = see
+        self.gates = gates
+        self.lights = lights
         self.localization_only = False
         self.relocalizations = 0
-        self._known = len(map.keyframes) > 0  # a map that the camera must first be found in
+        self._known = len(map.points)  # of a map that the camera must first be found in
+        self._berth = Berth(map)
+        self._missed = 0  # keyframes in a row that a map that is only read did not show
         self._reference = -1
         self._T_map_reference = SE3.identity()
         self.flown = Flown()
@@ -106,7 +116,7 @@ class InertialFront:
         """Where the smooth frame lies in the corrected one, as the map stands now."""
         if self._reference < 0:
             return SE3.identity()
-        return level(self.map.pose(self._reference) @ self._T_map_reference.inverse(), self._T_map_reference)
+        return level(self.map.pose(self._reference) @ self._T_map_reference.inverse(), self._T_map_reference.t)
 
     # -- parts --------------------------------------------------------------------------------------------------
 
@@ -118,22 +128,24 @@ class InertialFront:
         if step.status not in ("tracking", "degraded"):
             return self._nowhere(step, clock)
         new = None
-        if step.keyframe and not self.localization_only:
+        if step.keyframe:
             assert self.odometry.window is not None
             new = NewKeyframe(step, self.odometry.window.landmarks())
         with self.map.lock:
             self._settle_departed()
             if self._reference < 0 and self._known and step.keyframe:
-                self._find(step)
-            if self._reference < 0 and (self._known or new is None):
+                self._find(step, self.front_end.process(step.frame))
+            if self._reference < 0 and (self._known or self.localization_only or new is None):
                 return self._nowhere(step, clock, "not found in the map yet")
             reference, T_world_map = self._reference, self.T_world_map
             T_world_body = T_world_map @ step.state.T_world_body
             T_reference_body = self._T_map_reference.inverse() @ step.state.T_world_body
+            if self.lights and reference >= 0:
+                self.lights.tracked(t_ns, reference, T_reference_body)
         covariance = step.covariance[:6, :6].copy()
         turn = np.eye(6)
         turn[3:, 3:] = T_world_map.R
-        details = {"track_ms": clock.ms(), **_biases(step)}
+        details = {"track_ms": clock.ms(), **_motion(step, T_world_map)}
         estimate = Estimate(
             t_ns, step.status, T_world_body, turn @ covariance @ turn.T, step.why, step.inliers, details
         )  # fmt: skip
@@ -146,52 +158,93 @@ class InertialFront:
         estimate = Estimate(step.frame.t_ns, status, T, LOST_COVARIANCE, why or step.why, 0, details)
         return Located(step.frame, estimate, -1, SE3.identity())
 
-    def _find(self, step: OdometryStep) -> None:
-        """Look for a frame in the map that was given; sets where the odometry's frame lies in it."""
-        found = self.find(self.front_end.process(step.frame))
+    def _find(self, step: OdometryStep, seen: Features) -> None:
+        """Look for a keyframe of the window everywhere in the map."""
+        found = self.find(seen)
         if isinstance(found, str):
             return
-        T_world_map = level(found.T_world_body @ step.state.T_world_body.inverse(), step.state.T_world_body)
-        match = np.flatnonzero(found.point >= 0)
-        observers = self.map.shared_counts(found.point[match])
-        self._reference = int(np.argmax(observers))
-        self._T_map_reference = T_world_map.inverse() @ self.map.pose(self._reference)
+        reference = int(np.argmax(self.map.shared_counts(found.point[found.point >= 0])))
+        self._berth.forget()
+        self._hang(step, Tracked(step.frame.t_ns, seen, found.T_world_body, found.covariance, found.point, reference))
         self.relocalizations += 1
         self.emit(step.frame.t_ns, "relocalized", why=found.why)
 
-    def insert(self, new: NewKeyframe) -> int:
-        """A keyframe of the window becomes one of the map, and the reference of the frames that follow; its number.
+    def _look_up(self, step: OdometryStep, seen: Features) -> None:
+        """Where a keyframe of the window lies in a map that does not come of it: that moves the whole smooth frame."""
+        if step.restarted or self._missed >= LOST_KEYFRAMES:
+            self._find(step, seen)
+            return
+        known = len(self.map.points) if self.localization_only else self._known
+        tracked = self.tracker.track_at(step.frame.t_ns, seen, self.T_world_map @ step.state.T_world_body)
+        theirs = int(np.count_nonzero((tracked.point >= 0) & (tracked.point < known)))
+        if tracked.why_lost or theirs < max(MIN_MATCHES, tracked.n_inliers // 2):
+            self._missed += self.localization_only
+        else:
+            self._hang(step, tracked)
+
+    def _hang(self, step: OdometryStep, tracked: Tracked) -> None:
+        """Hold the odometry's frame to where a keyframe of the window was found in the map."""
+        self._missed = 0
+        self.tracker.accept(tracked)
+        T_world_map = self._berth.add(step.state.T_world_body, tracked.reference, tracked.T_reference_body)
+        self._reference = tracked.reference
+        self._T_map_reference = T_world_map.inverse() @ self.map.pose(self._reference)
+
+    def insert(self, new: NewKeyframe) -> tuple[int, Decision]:
+        """A keyframe of the window becomes one of the map, and the reference of the frames that follow, if the gates
+        let it; its number, or -1.
 
         What takes long in it the next frame need not wait for: from the thread that maps.
         """
         step = new.step
         seen = self.front_end.process(step.frame)
+        if self._known or self.localization_only:
+            with self.map.lock:
+                self._look_up(step, seen)
+        if self.localization_only:
+            return -1, Decision(False, "localization only")
         if not (seen.inv_depth > 0).any():
             seen = with_landmark_depth(seen, step.tracks, new.landmarks, self._T_map_cam(step))
         with self.map.lock:
             return self._insert(step, seen)
 
-    def _insert(self, step: OdometryStep, seen: Features) -> int:
+    def _insert(self, step: OdometryStep, seen: Features) -> tuple[int, Decision]:
         T_world_body = self.T_world_map @ step.state.T_world_body
         nothing = np.full(len(seen), -1, np.int32)
         tracked = Tracked(
             step.frame.t_ns, seen, T_world_body, step.covariance[:6, :6], nothing, max(self._reference, 0)
         )
+        decision = Decision(True, "")
         if self._reference >= 0:
             index = FeatureIndex(seen, self.tracker.camera.width, self.tracker.camera.height)
             matched = self.tracker.refine(step.frame.t_ns, seen, T_world_body, nothing, index, SEARCH)
+            decision = gated(self._candidate(step, T_world_body, matched), self.gates)
+            if not decision.insert:
+                return -1, decision
             if matched.n_inliers >= MIN_MATCHES:
                 tracked.point = matched.point
         keyframe = self.mapper.insert(
-            step.frame.t_ns, T_world_body, seen, tracked.point, 1.0, self._reference, tracked.noise
+            step.frame.t_ns, T_world_body, seen, tracked.point, decision.weight, self._reference, tracked.noise
         )  # fmt: skip
         self.map.keyframes.covariance[keyframe] = step.covariance[:6, :6]
         tracked.point[:] = self.map.points_of(keyframe)
         tracked.reference = keyframe
         self.tracker.accept(tracked)
+        if self.lights:
+            self.lights.inserted(keyframe, step.frame.t_ns)
         self._reference, self._T_map_reference = keyframe, step.state.T_world_body
         self.flown.number[step.frame.t_ns] = keyframe
-        return keyframe
+        return keyframe, decision
+
+    def _candidate(self, step: OdometryStep, T_world_body: SE3, matched: Tracked) -> Candidate:
+        """What gates ask about; the window has decided that there should be a keyframe."""
+        expected = self.map.points_of(self._reference)
+        confirmed = int(np.count_nonzero(self.map.points.n_obs[expected[expected >= 0]] >= 2))
+        return Candidate(
+            t_ns=step.frame.t_ns, inliers=matched.n_inliers, reference_points=max(confirmed, 1), close_tracked=0,
+            close_untracked=0, n_keyframes=len(self.map.keyframes), noise=1.0, since_keyframe_s=0.0,
+            since_relocalization_s=0.0, T_world_body=T_world_body, covariance=step.covariance[:6, :6],
+        )  # fmt: skip
 
     def _T_map_cam(self, step: OdometryStep) -> SE3:
         return step.state.T_world_body @ self.map.rig.cameras[0].T_body_cam
@@ -225,14 +278,6 @@ class InertialFront:
             self.flown.add(frame.state, imu, self.odometry.spec, frame.still_sigma > 0.0)
 
 
-def level(T: SE3, T_inner: SE3) -> SE3:
-    """The turn about z and the shift nearest to T that take T_inner to where T takes it."""
-    yaw = math.atan2(T.R[1, 0] - T.R[0, 1], T.R[0, 0] + T.R[1, 1])
-    c, s = math.cos(yaw), math.sin(yaw)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return SE3(R, T @ T_inner.t - R @ T_inner.t)
-
-
 def with_landmark_depth(seen: Features, tracks: Tracks, landmarks: Landmarks, T_map_cam: SE3) -> Features:
     """Corners that lie on a track of the window get the depth of its landmark."""
     _, row, landmark = np.intersect1d(tracks.id, landmarks.track, assume_unique=True, return_indices=True)
@@ -250,7 +295,10 @@ def with_landmark_depth(seen: Features, tracks: Tracks, landmarks: Landmarks, T_
     return seen.with_depth(inv_depth, sigma)
 
 
-def _biases(step: OdometryStep) -> dict[str, float]:
-    names = [f"bias_{kind}_{axis}" for kind in ("gyro", "accel") for axis in "xyz"]
-    values: Array = np.concatenate([step.state.bias_gyro, step.state.bias_accel])
-    return dict(zip(names, values.tolist(), strict=True))
+def _motion(step: OdometryStep, T_world_map: SE3) -> dict[str, float]:
+    """Velocity, m/s, world; biases, rad/s and m/s^2, and their standard deviations."""
+    names = [f"{kind}_{axis}" for kind in ("velocity", "bias_gyro", "bias_accel") for axis in "xyz"]
+    velocity, sigma = T_world_map.R @ step.state.v_world, np.sqrt(np.diag(step.covariance)[9:])
+    values: Array = np.concatenate([velocity, step.state.bias_gyro, step.state.bias_accel])
+    told = dict(zip(names, values.tolist(), strict=True))
+    return told | {f"sigma_{name}": s for name, s in zip(names[3:], sigma.tolist(), strict=True)}

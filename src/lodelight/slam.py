@@ -121,7 +121,8 @@ class Slam:
         if inertial:
             odometry = InertialOdometry(rig, visual, self.config.inertial, self.emit, self.config.seed)
             self.inertial = InertialFront(
-                odometry, self.map, self.front_end, self.tracker, self.mapper, find, self.emit, self.tags.see
+                odometry, self.map, self.front_end, self.tracker, self.mapper, find, self.emit, self.tags.see,
+                self.gates, self.lights,
             )  # fmt: skip
         self.live = live
         self.localization_only = False
@@ -175,10 +176,14 @@ class Slam:
         """One message; an estimate for every frame. With an IMU a frame waits for the sample behind it."""
         if isinstance(message, LightFix):
             if self.lights:
-                self.lights.feed(message)
+                with self.map.lock:  # with an IMU the gate asks from the thread that maps
+                    self.lights.feed(message)
             return None
         if self.inertial is not None:
             self.inertial.localization_only = self.localization_only
+            if self.lights and isinstance(message, Frame):
+                with self.map.lock:
+                    self._move_map()
             located = self.inertial.feed(message)
             return None if located is None else self._take(located)
         return self.step(message) if isinstance(message, Frame) else None
@@ -277,12 +282,14 @@ class Slam:
             return estimate
         self.path.append(PathNode(estimate.t_ns, located.reference, located.T_reference_body))
         if located.keyframe is not None:
-            self.emit(estimate.t_ns, "keyframe", inserted=True, why=located.keyframe.step.keyframe, weight=1.0)
             flown = FlownKeyframe(located, located.keyframe, len(self.path) - 1)
             # the first of all must be there before another frame can hang on it
             self.mapping.submit(self._put(flown) if located.reference < 0 else flown)
         T_world_body, covariance = self.tags.world(estimate.T_world_body), estimate.covariance
         details = {**estimate.details, "aligned": float(self.tags.aligned)}
+        if self.tags.T_world_map is not None:
+            velocity = self.tags.T_world_map.R @ [details[f"velocity_{axis}"] for axis in "xyz"]
+            details |= {f"velocity_{axis}": float(v) for axis, v in zip("xyz", velocity, strict=True)}
         return replace(
             estimate, T_world_body=T_world_body, covariance=self.tags.world_covariance(covariance), details=details
         )
@@ -303,9 +310,14 @@ class Slam:
         self.mapping.submit(keyframe)
 
     def _put(self, flown: FlownKeyframe) -> int:
-        """A keyframe of the inertial window into the map: there its frame hangs on itself."""
+        """A keyframe of the inertial window into the map: there its frame hangs on itself; -1 where it may not."""
+        assert self.inertial is not None
         located, node = flown.located, self.path[flown.at]
-        keyframe = self.inertial.insert(flown.new) if self.inertial is not None else -1
+        keyframe, decision = self.inertial.insert(flown.new)
+        why = "; ".join(filter(None, [flown.new.step.keyframe, decision.why]))
+        self.emit(node.t_ns, "keyframe", inserted=keyframe >= 0, why=why, weight=decision.weight)
+        if keyframe < 0:
+            return keyframe
         alone = node.reference < 0 or flown.new.step.restarted
         before = None if alone else (node.reference, node.T_reference_body)
         self.path[flown.at] = PathNode(node.t_ns, keyframe, SE3.identity(), before)
@@ -316,6 +328,8 @@ class Slam:
     def _map(self, job: MappingJob) -> None:
         clock = Stopwatch()
         keyframe = job if isinstance(job, int) else self._put(job)
+        if keyframe < 0:
+            return
         self.mapper.process(keyframe, self.mapping.interrupted)
         if self.map.keyframes.alive[keyframe]:
             self.loops.process(keyframe, self.mapping.interrupted)
@@ -374,8 +388,9 @@ def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSin
     gated, tight = config.gate.use == "lights", config.lights.use == "tight"
     if gated and tight:
         raise ConfigError("the gate and tight lights would count the same light twice; choose --gate or --lights tight")
-    if (gated or tight) and config.sensors.endswith("-inertial"):
-        raise ConfigError(f"lights are not used together with the IMU yet; choose {config.sensors.partition('-')[0]}")
     if tight and (map.rig.lights is None or not anchors.lights):
         raise ConfigError("tight lights need a light camera in the rig and [[light]] entries in the anchors")
-    return LightAnchor(map, config.gate, config.lights, anchors.lights, emit) if gated or tight else None
+    if not gated and not tight:
+        return None
+    upright = config.sensors.endswith("-inertial")
+    return LightAnchor(map, config.gate, config.lights, anchors.lights, emit, upright)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from lodelight.anchors import Anchors
     from lodelight.cli.watching import Watcher
+    from lodelight.evaluation.align import Mode
     from lodelight.io.recording import Recording
     from lodelight.mapping.map import Map
     from lodelight.messages import LightFix
@@ -61,8 +62,7 @@ def run(
 
     recording = open_source(source, rig, parse_roles(topic))
     asked = [f"gate.use={gate}", f"lights.use={lights}", *settings]
-    most = recording.rig.sensors if gate == "none" and lights == "off" else _visual(recording)
-    config = with_settings(SlamConfig(sensors=sensors or most, seed=seed), asked)
+    config = with_settings(SlamConfig(sensors=sensors or recording.rig.sensors, seed=seed), asked)
     known = load_map(map_file) if map_file else None
     surveyed = read_anchors(anchors) if anchors else None
     fixes: Iterable[LightFix] = ()
@@ -137,7 +137,8 @@ def slam_to_folder(
         mapped, first_ns, last_ns = 0, None, 0
         source, fixes = (watcher.of(recording), watcher.lights(fixes)) if watcher else (recording, fixes)
         for estimate in track(slam.run(source, start_s, end_s, fixes), "SLAM", recording.n_frames or None):
-            outputs.frame(estimate, estimate.details["track_ms"], sum(slam.mapping_ms[mapped:]))
+            details = dict(estimate.details)
+            outputs.frame(estimate, details.pop("track_ms"), sum(slam.mapping_ms[mapped:]), **details)
             mapped = len(slam.mapping_ms)
             first_ns, last_ns = first_ns or estimate.t_ns, estimate.t_ns
             if watcher:
@@ -148,17 +149,13 @@ def slam_to_folder(
         for skipped in recording.skipped:
             outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)
         save_map(slam.map, out / "map.lode")
+        upright: Mode = "yaw" if slam.inertial is not None else "se3"
         return outputs.finish(
             slam.trajectory(), slam.cloud(), {**slam.stats(), "skipped": len(recording.skipped)},
             recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
             recording_s=(last_ns - (first_ns or last_ns)) * 1e-9,
-            align="none" if slam.tags.aligned else "se3", tags=slam.tags.found(),
+            align="none" if slam.tags.aligned else upright, tags=slam.tags.found(),
         )  # fmt: skip
-
-
-def _visual(recording: Recording) -> str:
-    """The most a recording has without its IMU, with which lights are not used yet."""
-    return recording.rig.sensors.removesuffix("-inertial")
 
 
 def _summary(m: dict[str, Any], out: Path) -> str:

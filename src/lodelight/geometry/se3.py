@@ -6,6 +6,7 @@ R <- R Exp(dtheta), t <- t + dp. The translation is perturbed in the outer frame
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import overload
 
@@ -96,6 +97,14 @@ class SE3:
         """From self at u = 0 to other at u = 1: slerp and lerp."""
         w = so3_log(np.ascontiguousarray(self.R.T @ other.R))
         return SE3(self.R @ so3_exp(u * w), (1.0 - u) * self.t + u * other.t)
+
+
+def level(T: SE3, about: Array) -> SE3:
+    """The turn about z and the shift nearest to T that take the point `about` (3,) to where T takes it."""
+    yaw = math.atan2(T.R[1, 0] - T.R[0, 1], T.R[0, 0] + T.R[1, 1])
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return SE3(R, T @ about - R @ about)
 
 
 def carried_covariance(T_world_a: SE3, covariance_a: Array, T_world_b: SE3) -> Array:

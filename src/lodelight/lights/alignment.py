@@ -1,7 +1,8 @@
 """Where a map lies in the world, from pairs of one moment's pose by the lights and in the map.
 
 Tilt comes from the fixes' own level alone: a path on a floor says nothing of it, and a fit of all six degrees of
-freedom to its points would tip gravity over. Yaw and translation come from both. Source: science note A7, G13.
+freedom to its points would tip gravity over. Yaw and translation come from both. A map that an IMU levelled keeps its
+own tilt. Source: science note A7, G13.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lodelight.geometry.se3 import SE3
+from lodelight.geometry.se3 import SE3, level
 from lodelight.geometry.so3 import skew, so3_exp, so3_log
 from lodelight.types import Array, Bools
 
@@ -43,15 +44,20 @@ class Alignment:
         return int(np.count_nonzero(self.agrees))
 
 
-def align(pairs: Sequence[Pair]) -> Alignment:
-    """The alignment that most pairs agree with, each pair taken for a start in turn, then least squares over those."""
+def align(pairs: Sequence[Pair], upright: bool = False) -> Alignment:
+    """The alignment that most pairs agree with, each pair taken for a start in turn, then least squares over those.
+
+    upright : up is up in the map, by an IMU, so that only a turn about z and a shift are asked for
+    """
     rows = np.unique(np.linspace(0, len(pairs) - 1, min(TRIED, len(pairs))).round().astype(int)).tolist()
     starts = [pairs[i].T_world_body @ pairs[i].T_map_body.inverse() for i in rows]
+    if upright:
+        starts = [level(start, pairs[i].T_map_body.t) for i, start in zip(rows, starts, strict=True)]
     scored = [agreement(pairs, start, pairs[i].T_map_body.t) for i, start in zip(rows, starts, strict=True)]
     best = int(np.argmax([np.count_nonzero(s) for s in scored]))
     T, agrees = starts[best], scored[best]
     for _ in range(3):
-        T = _refined(T, [pair for pair, yes in zip(pairs, agrees, strict=True) if yes])
+        T = _refined(T, [pair for pair, yes in zip(pairs, agrees, strict=True) if yes], upright)
         again = agreement(pairs, T)
         if not again.any() or (again == agrees).all():
             break
@@ -70,8 +76,9 @@ def agreement(pairs: Sequence[Pair], T_world_map: SE3, pivot: Array | None = Non
     return out
 
 
-def _refined(T: SE3, pairs: Sequence[Pair]) -> SE3:
-    """Gauss-Newton over a turn about world axes and a translation."""
+def _refined(T: SE3, pairs: Sequence[Pair], upright: bool) -> SE3:
+    """Gauss-Newton over a turn about world axes, or z alone, and a translation."""
+    free = np.arange(2 if upright else 0, 6)
     for _ in range(STEPS):
         H, g = np.zeros((6, 6)), np.zeros(6)
         for pair in pairs:
@@ -84,6 +91,7 @@ def _refined(T: SE3, pairs: Sequence[Pair]) -> SE3:
             r = np.concatenate([turn / SIGMA_RAD, (there.t - pair.T_world_body.t) / SIGMA_M])
             H += J.T @ J
             g += J.T @ r
-        step = -np.linalg.solve(H + 1e-9 * np.eye(6), g)
+        step = np.zeros(6)
+        step[free] = -np.linalg.solve(H[np.ix_(free, free)] + 1e-9 * np.eye(len(free)), g[free])
         T = SE3(so3_exp(np.ascontiguousarray(step[:3])) @ T.R, T.t + step[3:])
     return SE3.from_matrix(T.matrix)

@@ -7,7 +7,7 @@ Source: science note A9 (the conditions of ORB-SLAM2's NeedNewKeyFrame, as publi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -149,6 +149,15 @@ def decide(c: Candidate, config: KeyframeConfig, gates: tuple[Gate, ...] = ()) -
         why = refuses(c, config)
         if why:
             return Decision(False, why)
+    said = gated(c, gates)
+    if not said.insert:
+        return said
+    why = "needs close points" if needs_close_points(c, config) else f"{c.inliers} of {c.reference_points} points left"
+    return replace(said, why="; ".join(filter(None, [why, said.why])))
+
+
+def gated(c: Candidate, gates: tuple[Gate, ...]) -> Decision:
+    """What the gates alone say of a frame that is to become a keyframe: the weight is the least of theirs."""
     weight, reasons = 1.0, []
     for gate in gates:
         said = gate(c)
@@ -158,5 +167,4 @@ def decide(c: Candidate, config: KeyframeConfig, gates: tuple[Gate, ...] = ()) -
             return Decision(False, said.can_wait)
         weight = min(weight, said.weight)
         reasons.append(said.why)
-    why = "needs close points" if needs_close_points(c, config) else f"{c.inliers} of {c.reference_points} points left"
-    return Decision(True, "; ".join([why, *reasons]), weight)
+    return Decision(True, "; ".join(reasons), weight)

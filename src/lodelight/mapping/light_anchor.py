@@ -37,11 +37,15 @@ NOT_YET = "the map's place in the world rests on less than ten fixes of three li
 
 
 class LightAnchor:
-    """One for a run. emit : told of what was decided, as emit(t_ns, kind, **fields)."""
+    """One for a run. emit : told of what was decided, as emit(t_ns, kind, **fields)
+
+    upright : the map is level by an IMU, which lights do not tilt
+    """
 
     def __init__(
-        self, map: Map, gate: GateConfig, lights: LightsConfig, surveyed: tuple[Light, ...], emit: Callable[..., None]
-    ) -> None:
+        self, map: Map, gate: GateConfig, lights: LightsConfig, surveyed: tuple[Light, ...], emit: Callable[..., None],
+        upright: bool = False,
+    ) -> None:  # fmt: skip
         self.map = map
         self.config = lights
         self.gate = LightGate(gate, map.rig.cameras[0].T_body_cam)
@@ -53,7 +57,7 @@ class LightAnchor:
         self._waiting: deque[LightFix] = deque(maxlen=WAITING)
         self._unread: deque[LightFix] = deque(maxlen=WAITING)
         self._path = BodyPath(map)
-        self._placement = Placement(self._path, self._lights, self.spec)
+        self._placement = Placement(self._path, self._lights, self.spec, upright)
         self._ties = LightTies(map, self._path, lights, self._lights, emit)
         self._clock = ClockCheck()
         self._continuity = Continuity()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lodelight.anchors import Light
-from lodelight.geometry.se3 import SE3, carried_covariance
+from lodelight.geometry.se3 import SE3, carried_covariance, level
 from lodelight.lights.alignment import Pair, agreement, align
 from lodelight.lights.rays import lay_down, settle
 from lodelight.mapping.body_path import BodyPath, Node
@@ -38,10 +38,14 @@ class Move:
 class Placement:
     """Of one map, in a building of surveyed lights; spec : of the light camera, None where only poses come.
 
+    upright : the map is level by an IMU, and is turned about the vertical and shifted alone
     placed : it has a place in the world, if only by one fix; aligned : for good
     """
 
-    def __init__(self, path: BodyPath, lights: Mapping[str, Light], spec: CameraSpec | None) -> None:
+    def __init__(
+        self, path: BodyPath, lights: Mapping[str, Light], spec: CameraSpec | None, upright: bool = False
+    ) -> None:
+        self._upright = upright
         self._fewest = min(ALIGN_LIGHTS, len(lights))
         self._path = path
         self._lights = lights
@@ -69,7 +73,8 @@ class Placement:
             del self._met[1::2]  # the whole way, half as dense
         if not self.placed:
             self.placed = True
-            return Move(T_world_body @ self._path.pose(node).inverse(), "seeded by the first fix", 1)
+            T_world_map = T_world_body @ self._path.pose(node).inverse()
+            return Move(self._level(T_world_map, node), "seeded by the first fix", 1)
         return self._review() if not self.aligned or len(self._met) % ALIGN_PAIRS == 0 else None
 
     def see(self, fix: LightFix, node: Node | None) -> Move | None:
@@ -82,16 +87,18 @@ class Placement:
         self.placed = self.aligned = True
         self.no_fit = ""
         self._laid = fix.t_ns, laid.T_world_map, laid.covariance
-        return Move(laid.T_world_map, f"the rays to {', '.join(laid.lights)} meet where they hang", len(laid.lights))
+        T_world_map = self._level(laid.T_world_map, node)
+        return Move(T_world_map, f"the rays to {', '.join(laid.lights)} meet where they hang", len(laid.lights))
 
     def settle(self, without: Mapping[str, object]) -> Move | None:
         """By all lights that were passed, but for those; where poses by them alone were tipped, this is not."""
         lights = {name: light for name, light in self._lights.items() if name not in without}
         tracks = self._rays.tracks()
         laid = settle(SE3.identity(), tracks, lights, *self._rays.up()) if self.aligned and tracks else None
-        return (
-            None if laid is None else Move(laid.T_world_map, f"by the rays to {len(laid.lights)} lights", len(tracks))
-        )
+        if laid is None:
+            return None
+        T_world_map = self._level(laid.T_world_map, self._met[-1][2] if self._met else None)
+        return Move(T_world_map, f"by the rays to {len(laid.lights)} lights", len(tracks))
 
     def _review(self) -> Move | None:
         """Align with what most pairs say: once for good, and again only where they contradict what was believed."""
@@ -105,7 +112,7 @@ class Placement:
         now = int(np.count_nonzero(agrees))
         if self.aligned and now >= 0.5 * len(pairs):
             return None
-        found = align(pairs)
+        found = align(pairs, self._upright)
         if found.count < max(ALIGN_PAIRS, ALIGN_SHARE * len(pairs)) or (self.aligned and found.count < 2 * now):
             if not self.aligned and len(pairs) >= 2 * ALIGN_PAIRS:
                 self.no_fit = f"only {found.count} of {len(pairs)} poses by the lights agree on a place of the map"
@@ -118,6 +125,12 @@ class Placement:
         last, T_world_body, _ = used[-1]
         self._laid = last.t_ns, T_world_body, np.mean([fix.covariance for fix, _, _ in used], axis=0)
         return Move(found.T_world_map, f"{found.count} of {len(pairs)} pairs agree", len(pairs), again)
+
+    def _level(self, T_world_map: SE3, node: Node | None) -> SE3:
+        """Without the tilt, where the map needs none; the body stays where it was put."""
+        if not self._upright:
+            return T_world_map
+        return level(T_world_map, self._path.pose(node).t if node is not None else np.zeros(3))
 
     def _explained(self, fix: LightFix, pair: Pair) -> bool:
         off = pair.T_world_body.inverse() @ pair.T_map_body
