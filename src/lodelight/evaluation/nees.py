@@ -52,6 +52,15 @@ def nees(estimate: Trajectory, truth: Trajectory, covariance: Array) -> Nees | N
     )
 
 
+def nees_of(estimate: Trajectory, truth: Trajectory, covariance: Array) -> Array:
+    """(N,) of each pose, divided by its six degrees of freedom; NaN where its covariance is not positive definite."""
+    finite: Array = np.where(np.isfinite(covariance).all(axis=(1, 2), keepdims=True), covariance, 0.0)
+    proper = np.linalg.eigvalsh(finite)[:, 0] > 0.0
+    out = np.full(len(covariance), np.nan)
+    out[proper] = _squared(chart_errors(estimate, truth)[proper], covariance[proper]) / 6
+    return out
+
+
 def chart_errors(estimate: Trajectory, truth: Trajectory) -> Array:
     """d (N, 6) with truth = estimate.perturbed(d): Log(R_estimate^T R_truth), then p_truth - p_estimate."""
     turned = Rotation.from_quat(estimate.quat_xyzw).inv() * Rotation.from_quat(truth.quat_xyzw)

@@ -17,7 +17,10 @@ Figure: TypeAlias = dict[str, Any]
 MAX_SAMPLES = 6000
 MAX_POINTS = 30_000
 
-FINAL, LIVE, TRUTH = "#2f7ff0", "#f08a24", "#8a94a3"
+FINAL, LIVE, TRUTH, TAG = "#2f7ff0", "#f08a24", "#8a94a3", "#c02f8f"
+AXES = ("#e0443e", "#2fa866", "#8a5cf0")
+NEES_95 = (0.206, 2.408)  # of six degrees of freedom, per degree: 2.5 and 97.5 % of a chi-square distribution
+MAX_SHADE = 4000  # map points behind the path from above
 STATE_COLOURS = {
     "initializing": "#9aa5b4",
     "tracking": "#2fa866",
@@ -124,6 +127,59 @@ def sigma(run: RunFolder) -> Figure:
     return over_time(traces, "1 sigma", yaxis={"type": "log", "rangemode": "normal"})
 
 
+def biases(run: RunFolder, kind: str, unit: str, per: float) -> Figure | None:
+    """Of the "gyro" or "accel", each axis between its two standard deviations; None where there was no IMU."""
+    traces: list[Figure] = []
+    for axis, colour in zip("xyz", AXES, strict=True):
+        value, sigma = run.column(f"bias_{kind}_{axis}"), run.column(f"sigma_bias_{kind}_{axis}")
+        if value is None or sigma is None:
+            return None
+        rows = thinned(len(value[0]))
+        t_s, middle, off = value[0][rows], per * value[1][rows], per * sigma[1][rows]
+        for y, fill in ((middle - off, "none"), (middle + off, "tonexty")):
+            band = {"fill": fill, "fillcolor": f"{colour}30", "showlegend": False, "hoverinfo": "skip"}
+            traces.append(line(t_s, y, axis, colour, line={"width": 0}, **band))
+        traces.append(line(t_s, middle, axis, colour))
+    return over_time(traces, unit, yaxis={"rangemode": "normal"})
+
+
+def velocity(run: RunFolder) -> Figure | None:
+    """As estimated at the time, and the true speed where the truth is known; None where nothing estimates it."""
+    columns = [run.column(f"velocity_{axis}") for axis in "xyz"]
+    if columns[0] is None:
+        return None
+    rows = thinned(len(columns[0][0]))
+    traces = [
+        line(c[0][rows], c[1][rows], axis, colour, line={"width": 1})
+        for axis, colour, c in zip("xyz", AXES, columns, strict=True)
+        if c is not None
+    ]
+    speed = np.sqrt(sum(c[1] ** 2 for c in columns if c is not None))
+    if run.truth is not None and run.final.alignment is not None and len(run.truth) > 2:
+        t_s = run.seconds(run.truth.t_ns)
+        true = np.linalg.norm(np.gradient(run.truth.xyz, t_s, axis=0), axis=1)
+        during = np.flatnonzero((t_s >= columns[0][0][0]) & (t_s <= columns[0][0][-1]))
+        during = during[thinned(len(during))]
+        traces.insert(0, line(t_s[during], true[during], "true speed", TRUTH, line={"width": 4}, opacity=0.6))
+    traces.append(line(columns[0][0][rows], speed[rows], "speed", FINAL))
+    return over_time(traces, "m/s", yaxis={"rangemode": "normal"})
+
+
+def nees(run: RunFolder) -> Figure | None:
+    """Of the live poses, with 1 and the band that holds 95 % of honest ones; None without truth and covariance."""
+    if run.nees is None or not np.isfinite(run.nees.nees).any():
+        return None
+    t_ns, value = run.nees.t_ns, run.nees.nees
+    rows = thinned(len(value), np.nan_to_num(value))
+    t_s, y = broken(t_ns, rows, run.seconds(t_ns), value)
+    across = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "line": {"color": TRUTH, "width": 1}}
+    marks = [(1.0, "solid"), *((bound, "dot") for bound in NEES_95)]
+    shapes = [across | {"y0": at, "y1": at, "line": {"color": TRUTH, "width": 1, "dash": dash}} for at, dash in marks]
+    figure = over_time([line(t_s, y, "NEES / 6", FINAL)], "per degree of freedom", yaxis={"type": "log"}, shapes=shapes)
+    figure["layout"]["yaxis"]["rangemode"] = "normal"
+    return figure
+
+
 def errors_over(run: RunFolder, abscissa: str) -> Figure:
     """Position error in cm, left, and rotation error in degrees, right, over time or over the distance travelled."""
     traces = []
@@ -144,9 +200,13 @@ def errors_over(run: RunFolder, abscissa: str) -> Figure:
 
 
 def plane(run: RunFolder, axes: str) -> Figure:
-    """The path projected on two world axes, to scale."""
+    """The path projected on two world axes, to scale, with the tags; from above over the map's points."""
     i, j = ("xyz".index(axis) for axis in axes)
     traces = []
+    if axes == "xy":
+        xyz, _ = _cloud(run, MAX_SHADE)
+        dots = {"mode": "markers", "marker": {"color": TRUTH, "size": 1.5, "opacity": 0.5}, "hoverinfo": "skip"}
+        traces.append(line(xyz[:, i], xyz[:, j], "map points", TRUTH, **dots))
     if run.truth is not None and run.final.alignment is not None:
         xyz = _during(run.truth.xyz, run.truth.t_ns, run)
         traces.append(line(xyz[:, i], xyz[:, j], "truth", TRUTH, opacity=0.6, line={"width": 4}))
@@ -156,6 +216,11 @@ def plane(run: RunFolder, axes: str) -> Figure:
     xyz = keyframes(run)
     marks = {"mode": "markers", "marker": {"color": FINAL, "size": 4, "symbol": "square-open"}}
     traces.append(line(xyz[:, i], xyz[:, j], "keyframes", FINAL, **marks))
+    names, spots = tags(run)
+    if names:
+        marks = {"mode": "markers+text", "marker": {"color": TAG, "size": 8, "symbol": "square"}}
+        said = {"text": names, "textposition": "top right", "textfont": {"color": TAG, "size": 11}}
+        traces.append(line(spots[:, i], spots[:, j], "tags", TAG, **marks, **said))
     x_axis = {"title": {"text": f"{axes[0]} (m)"}}
     y_axis = {"title": {"text": f"{axes[1]} (m)"}, "scaleanchor": "x", "scaleratio": 1}
     return {"data": traces, "layout": {"xaxis": x_axis, "yaxis": y_axis}}
@@ -163,24 +228,42 @@ def plane(run: RunFolder, axes: str) -> Figure:
 
 def space(run: RunFolder) -> Figure:
     """Map points, coloured by height, with path and keyframes; far strays are left outside the box."""
-    count = len(run.cloud_xyz)
-    xyz = run.cloud_xyz[np.linspace(0, count, min(count, MAX_POINTS), endpoint=False, dtype=int)]
-    if run.final.alignment is not None and len(xyz):
-        a = run.final.alignment
-        xyz = a.scale * xyz @ a.R.T + a.t
+    xyz, (low, high) = _cloud(run, MAX_POINTS)
     poses = run.final.poses
     (path,) = broken(poses.t_ns, thinned(len(poses)), poses.xyz)
-    low, high = _box(xyz, poses.xyz)
-    xyz = xyz[((xyz >= low) & (xyz <= high)).all(axis=1)]
     marker = {"size": 1.4, "color": packed(xyz[:, 2]), "colorscale": "Viridis", "opacity": 0.8}
     traces = [
         {"name": "map points", "mode": "markers", "marker": marker, "hoverinfo": "skip", **_xyz(xyz)},
         {"name": "path", "mode": "lines", "line": {"color": FINAL, "width": 4}, **_xyz(path)},
         {"name": "keyframes", "mode": "markers", "marker": {"size": 2.5, "color": LIVE}, **_xyz(keyframes(run))},
     ]
+    names, spots = tags(run)
+    if names:
+        marker = {"size": 5, "color": TAG, "symbol": "square"}
+        traces.append({"name": "tags", "mode": "markers+text", "marker": marker, "text": names, **_xyz(spots)})
     ranges = {f"{axis}axis": {"range": [float(low[k]), float(high[k])]} for k, axis in enumerate("xyz")}
     camera = {"eye": {"x": -0.9, "y": -1.2, "z": 0.85}, "center": {"x": 0, "y": 0, "z": -0.1}}
     return {"data": traces, "layout": {"scene": {"aspectmode": "data", "camera": camera, **ranges}}}
+
+
+def tags(run: RunFolder) -> tuple[list[str], Array]:
+    """Names, and where they hang in what is drawn, (N, 3) m."""
+    placed = [(tag.id, tag.T_world_tag.t) for tag in run.tags if tag.T_world_tag is not None]
+    return [name for name, _ in placed], _drawn(np.array([spot for _, spot in placed]).reshape(-1, 3), run)
+
+
+def _drawn(xyz: AnyArray, run: RunFolder) -> Array:
+    """Points (N, 3) of the run in the frame that is drawn."""
+    a = run.final.alignment
+    return np.asarray(xyz if a is None else a.scale * xyz @ a.R.T + a.t, dtype=float)
+
+
+def _cloud(run: RunFolder, most: int) -> tuple[Array, tuple[Array, Array]]:
+    """Map points, evenly chosen, without strays; and the box they lie in."""
+    count = len(run.cloud_xyz)
+    xyz = _drawn(run.cloud_xyz[np.linspace(0, count, min(count, most), endpoint=False, dtype=int)], run)
+    low, high = _box(xyz, run.final.poses.xyz)
+    return xyz[((xyz >= low) & (xyz <= high)).all(axis=1)], (low, high)
 
 
 def keyframes(run: RunFolder) -> Array:

@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData
 
+from lodelight.anchors import Tag
 from lodelight.errors import SourceError
 from lodelight.evaluation.align import Alignment, Mode, align
 from lodelight.evaluation.associate import matched
 from lodelight.evaluation.ate import pose_errors
+from lodelight.evaluation.nees import nees_of
 from lodelight.evaluation.rpe import travelled_m
+from lodelight.io.anchors_toml import read_anchors
 from lodelight.io.covariances import read_covariances
 from lodelight.io.trajectories import read_trajectory
 from lodelight.trajectory import Trajectory
@@ -43,8 +46,19 @@ class Path3D:
 
 
 @dataclass(frozen=True, eq=False)
+class Consistency:
+    """Squared error of each live pose, after alignment, over its covariance, per degree of freedom: t_ns, nees (N,)."""
+
+    t_ns: NDArray[np.int64]
+    nees: Array
+
+
+@dataclass(frozen=True, eq=False)
 class RunFolder:
-    """frames : columns of `frames.csv`, times in s since the first; events : lines of `events.jsonl`."""
+    """frames : columns of `frames.csv`, times in s since the first; events : lines of `events.jsonl`
+
+    tags : as they were found; nees : None where there is no truth, or no covariance
+    """
 
     name: str
     metrics: dict[str, Any]
@@ -54,9 +68,20 @@ class RunFolder:
     live: Path3D
     truth: Trajectory | None
     cloud_xyz: ArrayF32
+    tags: tuple[Tag, ...]
+    nees: Consistency | None
     sigma_t_ns: NDArray[np.int64]
     sigma_m: Array
     sigma_deg: Array
+
+    def column(self, name: str) -> tuple[Array, Array] | None:
+        """Seconds (N,) and values (N,) of the frames that have something in a further column; None where none has."""
+        cells = self.frames.get(name, [])
+        rows = [i for i, cell in enumerate(cells) if cell]
+        if not rows:
+            return None
+        t_ns = np.array([int(self.frames["t_ns"][i]) for i in rows], dtype=np.int64)
+        return self.seconds(t_ns), np.array([float(cells[i]) for i in rows])
 
     def seconds(self, t_ns: NDArray[np.int64]) -> Array:
         """Stamps as seconds since the first frame."""
@@ -79,15 +104,18 @@ def read_folder(out: Path, truth: Trajectory | None, mode: Mode) -> RunFolder:
         raise SourceError(f"{out} is no complete out folder ({error}); run again") from None
     t_ns, covariances = read_covariances(out / "covariance.csv")
     variances = np.einsum("nii->ni", covariances)
+    live = _placed(_poses(out / "trajectory_live.tum"), truth, mode)
     return RunFolder(
         name=out.resolve().name,
         metrics=metrics,
         frames=frames,
         events=events,
         final=_placed(_poses(out / "trajectory.tum"), truth, mode),
-        live=_placed(_poses(out / "trajectory_live.tum"), truth, mode),
+        live=live,
         truth=truth,
         cloud_xyz=cloud[np.isfinite(cloud).all(axis=1)],
+        tags=read_anchors(out / "anchors.toml").tags,
+        nees=_consistency(live, truth, t_ns, covariances),
         sigma_t_ns=t_ns,
         sigma_m=np.sqrt(variances[:, 3:].sum(axis=1)),
         sigma_deg=np.rad2deg(np.sqrt(variances[:, :3].sum(axis=1))),
@@ -111,3 +139,15 @@ def _placed(poses: Trajectory, truth: Trajectory | None, mode: Mode) -> Path3D:
     distance, angle = pose_errors(alignment.apply(ours), true)
     errors = Errors(ours.t_ns, distance, np.rad2deg(angle), travelled_m(true))
     return Path3D(alignment.apply(poses), alignment, errors)
+
+
+def _consistency(
+    live: Path3D, truth: Trajectory | None, t_ns: NDArray[np.int64], covariance: Array
+) -> Consistency | None:
+    if truth is None or live.alignment is None:
+        return None
+    ours, true = matched(live.poses, truth)
+    stamps, pose, row = np.intersect1d(ours.t_ns, t_ns, return_indices=True)
+    turn = np.eye(6)
+    turn[3:, 3:] = live.alignment.scale * live.alignment.R
+    return Consistency(stamps, nees_of(ours.rows(pose), true.rows(pose), turn @ covariance[row] @ turn.T))

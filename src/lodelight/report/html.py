@@ -67,7 +67,7 @@ def _plots(run: RunFolder) -> dict[str, tuple[str, str, bool, Figure]]:
     if run.frames["t_ns"]:
         drawn["states"] = ("State", "", True, figures.states(run))
     if len(run.final.poses):
-        drawn["above"] = ("Path, x-y", "From above where z points up.", False, figures.plane(run, "xy"))
+        drawn["above"] = ("Path, x-y", f"From above where z points up.{_tags(run)}", False, figures.plane(run, "xy"))
         drawn["side"] = ("Path, x-z", "From the side where z points up.", False, figures.plane(run, "xz"))
         count = len(run.cloud_xyz)
         shown = f"{min(count, figures.MAX_POINTS):,} of {count:,} map points" if count else "no map points"
@@ -80,10 +80,28 @@ def _plots(run: RunFolder) -> dict[str, tuple[str, str, bool, Figure]]:
         note = "Tracking: from the decoded image to its pose. Mapping: what a keyframe costs besides."
         drawn["timing"] = ("Time per frame", note, False, figures.timing(run))
         drawn["inliers"] = ("Inliers", "Map points that agree with the frame's pose.", False, figures.inliers(run))
+    speed = figures.velocity(run)
+    if speed:
+        drawn["velocity"] = ("Velocity", "As estimated at the time, world axes.", False, speed)
+    for kind, title, unit, per in (
+        ("gyro", "Bias of the gyroscope", "mrad/s", 1e3), ("accel", "Bias of the accelerometer", "m/s²", 1.0)
+    ):  # fmt: skip
+        bias = figures.biases(run, kind, unit, per)
+        if bias:
+            drawn[f"bias-{kind}"] = (title, "As estimated at the time, within one standard deviation.", False, bias)
+    consistency = figures.nees(run)
+    if consistency:
+        note = "Squared error of the live poses, after one alignment of the whole path, over what the system believed."
+        drawn["nees"] = ("NEES", f"{note} 1 is honest; 95 % of honest ones lie between the dots.", False, consistency)
     if len(run.sigma_m):
         note = "What the system believed of its own error at the time; root of the summed variances."
         drawn["sigma"] = ("Uncertainty", note, True, figures.sigma(run))
     return drawn
+
+
+def _tags(run: RunFolder) -> str:
+    n = len(figures.tags(run)[0])
+    return f" {n} tag{'s' if n > 1 else ''} as found." if n else ""
 
 
 def section(name: str, title: str, note: str, wide: bool) -> str:
