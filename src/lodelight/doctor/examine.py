@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from lodelight.doctor.gather import BUDGET_FRAMES, STRETCH_S, Seen, gather
 from lodelight.doctor.lever import lever_of
 from lodelight.doctor.metric import Move, field_of, move_of
 from lodelight.doctor.squares import squares_of
-from lodelight.doctor.turning import Gyro, Turn, align, turn_of
+from lodelight.doctor.turning import Gyro, align, turn_of
 from lodelight.io.recording import Recording
 from lodelight.io.stamps import NS_PER_S
 from lodelight.messages import Imu
@@ -23,6 +22,7 @@ from lodelight.types import Array
 # Limits: half of what spoils a run, and above what good recordings of known rigs show (docs/doctor.md).
 OFFSET_MS, TURN_DEG, FOCAL, EPIPOLAR_PX, AIM_CM, REGION_PX = 3.5, 1.3, 0.018, 1.0, 1.0, 1.0
 SHIFT_CM, SQUARE_PX, ASPECT = 2.0, 1.0, 0.015
+SURE = 2.5  # sigmas that know how alike errors are (`findings.jackknifed`); others are believed at four
 DEGREES = (40.0, 80.0)  # what a gyro in degrees shows over what vision does
 
 
@@ -181,22 +181,21 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             *out,
             Finding("camera and IMU", "fault" if found.correlation < 0.5 else "note", text, found.correlation),
         ]
-    offset = measured(
-        "time offset", 1e3 * found.offset_s, 1e3 * found.sigma_offset_s, OFFSET_MS, "ms",
-        "images and IMU agree to {value:.1f} ms (+- {sigma:.1f})",
-        "time offset: images are stamped {value:+.1f} ms (+- {sigma:.1f}) wrong against the IMU; "
-        "add it to the cameras' time_offset_s",
+    out.append(
+        measured(
+            "time offset", 1e3 * found.offset_s, 1e3 * found.sigma_offset_s, OFFSET_MS, "ms",
+            "images and IMU agree to {value:.1f} ms (+- {sigma:.1f})",
+            "time offset: images are stamped {value:+.1f} ms (+- {sigma:.1f}) wrong against the IMU; "
+            "add it to the cameras' time_offset_s", times=SURE,
+        )
     )  # fmt: skip
-    if offset.level == "fault" and not _in_both_halves(turns, Gyro(t_ns, rate), R_body_cam, found.offset_s):
-        text = f"{offset.value:+.1f} ms (+- {offset.sigma:.1f}), but only a part of the recording shows it: turn more"
-        offset = replace(offset, level="note", text=text)
-    out.append(offset)
     turn_deg, sigma_deg = _sure(np.degrees(found.turn_rad), np.degrees(found.sigma_turn_rad))
     out.append(
         measured(
             "IMU turn", turn_deg, sigma_deg, TURN_DEG, "deg",
             "cam0 stands to the IMU as the rig says, to {value:.2f} deg (+- {sigma:.2f})",
             "extrinsics: cam0 is turned by {value:.2f} deg (+- {sigma:.2f}) against the IMU; calibrate T_body_cam anew",
+            times=SURE,
         )
     )  # fmt: skip
     out.append(
@@ -204,6 +203,7 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             "focal length", 100 * (found.scale - 1), 100 * found.sigma_scale, 100 * FOCAL, "%",
             "images turn as the gyro does, to {value:.2f} % (+- {sigma:.2f})",
             "focal length: the true one is {value:+.1f} % (+- {sigma:.1f}) off the rig's, by the gyro; calibrate anew",
+            times=SURE,
         )
     )  # fmt: skip
     if any(f.level == "fault" for f in out):
@@ -220,16 +220,6 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             )
         )  # fmt: skip
     return out
-
-
-def _in_both_halves(turns: list[Turn], gyro: Gyro, R_body_cam: Array, offset_s: float) -> bool:
-    """Whether each half of the recording, by itself, shows half of an offset at least: clocks are off all the time."""
-    middle = len(turns) // 2
-    for half in (turns[:middle], turns[middle:]):
-        found = align(half, gyro, R_body_cam)
-        if found is None or found.offset_s * offset_s < 0.5 * offset_s**2:
-            return False
-    return True
 
 
 def _sure(turn: Array, sigma: Array) -> tuple[float, float]:

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from lodelight.types import Array, Ints
+
 Level = Literal["ok", "note", "fault"]
 
 
@@ -37,3 +41,23 @@ def measured(
     if not wrong and unsure:
         text = f"this motion does not tell it (within {sigma:.2g} {unit})"
     return Finding(name, "fault" if wrong else "ok", text, value, unit, sigma)
+
+
+def jackknifed(J: Array, weight: Array, r: Array, block: Ints) -> Array:
+    """(n, n) covariance of a weighted least-squares solution by what each block of residuals, left out, does to it.
+
+    Errors are alike for as long as the same walker or the same bad corner of a lens is in view: what comes of a single
+    turn of the body goes with it, and is not sure however many frames show it.
+    J (N, n), weight (N,), r (N,) : at the solution; block (M,) : of the first M rows, the others are always in
+    Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, 11.5; one Newton step for each block.
+    """
+    H = (J.T * weight) @ J
+    names = np.unique(block)
+    moved = []
+    for name in names:
+        out = np.flatnonzero(block == name)
+        JW = J[out].T * weight[out]
+        moved.append(np.linalg.lstsq(H - JW @ J[out], JW @ r[out], rcond=None)[0])
+    d = np.array(moved)
+    covariance: Array = (len(names) - 1) / len(names) * d.T @ d
+    return covariance

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from lodelight.doctor.findings import jackknifed
 from lodelight.doctor.gather import Pair
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.so3 import so3_exp, so3_log
@@ -19,6 +20,8 @@ LEAST_PAIRS = 12
 LEAST_TURN = 0.004  # rad, of pairs in the root mean square
 LEAST_SIGMA = 0.4e-3  # rad
 SEARCH_S, STEP_S = 0.5, 0.005
+HUBER = 2.0  # sigmas
+BLOCK_S = 2.0  # for which errors may be alike
 # How wrong things may well be: offset s, turn rad, gyro bias rad/s, scale. Where a motion tells nothing of one of them
 # (a cart turns about one axis only), these keep it where the rig has it, and its sigma is as large as they are.
 MAYBE = np.array([0.05, *[0.3] * 3, *[0.05] * 3, 0.1])
@@ -240,14 +243,18 @@ def _fine(
             return np.concatenate([*misses, x / MAYBE])
 
         fit = least_squares(
-            residual, np.zeros(8), loss="huber", f_scale=2.0, x_scale=[0.01, *[0.05] * 3, *[0.01] * 3, 0.05]
+            residual, np.zeros(8), loss="huber", f_scale=HUBER, x_scale=[0.01, *[0.05] * 3, *[0.01] * 3, 0.05]
         )
         at += float(np.clip(fit.x[0], -0.02, 0.02))
         if abs(fit.x[0]) < 2e-4:
             break
     spread = max(1.0, 1.4826 * float(np.median(np.abs(residual(fit.x)))))
-    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * spread**2
-    sigma = np.sqrt(np.diag(covariance))
+    block = (0.5 * (a_s + b_s) // BLOCK_S).astype(int)
+    r = residual(fit.x)
+    J = np.column_stack([(residual(fit.x + d) - r) / 1e-6 for d in 1e-6 * np.eye(8)])
+    weight = np.minimum(1.0, HUBER / np.maximum(np.abs(r), 1e-12))
+    by_blocks = jackknifed(J, weight, r, np.repeat(block, 3))
+    sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * spread**2, np.diag(by_blocks)))
     turned = (middle + slope * fit.x[0] - fit.x[4:7] * length) @ (R_body_cam @ so3_exp(fit.x[1:4]))
     left = 1.4826 * float(np.median(np.abs(vision - turned)))
     return Alignment(
