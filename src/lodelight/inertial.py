@@ -90,6 +90,7 @@ class InertialFront:
         self._known = len(map.points)  # of a map that the camera must first be found in
         self._berth = Berth(map)
         self._missed = 0  # keyframes in a row that a map that is only read did not show
+        self._hung_ns = -1  # the last one that it did show
         self._reference = -1
         self._T_map_reference = SE3.identity()
         self.flown = Flown()
@@ -184,7 +185,7 @@ class InertialFront:
 
     def _hang(self, step: OdometryStep, tracked: Tracked) -> None:
         """Hold the odometry's frame to where a keyframe of the window was found in the map."""
-        self._missed = 0
+        self._missed, self._hung_ns = 0, step.frame.t_ns
         self.tracker.accept(tracked)
         T_world_map = self._berth.add(step.state.T_world_body, tracked.reference, tracked.T_reference_body)
         self._reference = tracked.reference
@@ -198,7 +199,7 @@ class InertialFront:
         """
         step = new.step
         seen = self.front_end.process(step.frame)
-        if self._known or self.localization_only:
+        if (self._known or self.localization_only) and self._hung_ns != step.frame.t_ns:
             with self.map.lock:
                 self._look_up(step, seen)
         if self.localization_only:
