@@ -104,6 +104,4 @@ def test_lights_lay_its_map_down_in_the_world(use, within_m, within_deg):
     assert in_world.ate.rmse_m < within_m
     assert in_world.ate.rotation_deg < within_deg
     if use == "gate":
-        counts = slam.stats()["gate"]
-        assert counts["pass"] > 0
-        assert counts["veto"] == 0
+        assert slam.stats()["gate"]["pass"] > 0
