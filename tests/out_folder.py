@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lodelight.anchors import Tag
 from lodelight.geometry.se3 import SE3
 from lodelight.messages import Estimate
 from lodelight.report.outputs import Outputs
@@ -48,6 +49,9 @@ def make_run(
     world = SE3.exp(np.array([0.1, -0.2, 0.7, 1.0, 2.0, 0.3]))
     lost = slice(frames // 2, frames // 2 + max(frames // 20, 1))
 
+    axes = [f"{kind}_{axis}" for kind in ("bias_gyro", "bias_accel") for axis in "xyz"]
+    motion = dict.fromkeys(axes, 0.01) | {f"sigma_{name}": 0.001 for name in axes}
+    motion |= {f"velocity_{axis}": 0.5 for axis in "xyz"}
     final = []
     with Outputs(out, {"seed": seed, "source": "made-up room", "slam": {"window": 10, "resume": None}}) as outputs:
         for i in range(frames):
@@ -62,6 +66,7 @@ def make_run(
                 Estimate(t_ns[i], status, pose, covariance, why, int(rng.normal(220, 25)) if status != "lost" else 5),
                 track_ms=slow_ms * (14 + rng.gamma(2, 2.0)),
                 map_ms=slow_ms * (30 + rng.gamma(3, 8.0)) if keyframe else 0.0,
+                **motion,
             )
             if status == "tracking":
                 reason = "0.71 of the reference keyframe's points seen" if keyframe else "enough overlap"
@@ -78,4 +83,5 @@ def make_run(
             wall_s=0.62 * recording_s + 4.2,
             compile_s=4.2,
             recording_s=recording_s,
+            tags=[Tag("qr", "T07", 0.2, world @ SE3(np.eye(3), np.array([1.0, 2.9, 1.4])))],
         )

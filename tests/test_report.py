@@ -24,8 +24,8 @@ FLAGS = [
     *("--no-proxy-server", "--host-resolver-rules=MAP * ~NOTFOUND"),
     *("--enable-logging=stderr", "--window-size=1400,3000", "--virtual-time-budget=20000"),
 ]
-FLAT_PLOTS = {"states", "above", "side", "timing", "inliers", "sigma"}
-TRUTH_PLOTS = {"error-time", "error-distance"}
+FLAT_PLOTS = {"states", "above", "side", "timing", "inliers", "sigma", "velocity", "bias-gyro", "bias-accel"}
+TRUTH_PLOTS = {"error-time", "error-distance", "nees"}
 
 
 def browse(page, profile):
@@ -66,7 +66,10 @@ def test_the_page_draws_every_plot_without_error_or_request(tmp_path, truth):
     counts = drawn(dom)
     assert set(counts) == FLAT_PLOTS | {"map"} | (TRUTH_PLOTS if truth else set())
     assert all(counts[name] >= 1 for name in counts if name != "map"), counts
-    assert counts["above"] == (4 if truth else 3)  # truth, live, final, keyframes
+    assert counts["above"] == (6 if truth else 5)  # map points, truth, live, final, keyframes, tags
+    assert dom.count("T07") >= 2  # beside its tag, from above and from the side
+    assert counts["bias-gyro"] == 9  # three axes, each with its band
+    assert counts["velocity"] == (5 if truth else 4)  # three axes, speed, true speed
     assert counts["states"] == 5
     space = dom.split('id="map"')[1].split("</section>")[0]
     assert re.search(r'<canvas[^>]*width="\d{3}', space), "the map is drawn on a canvas"
