@@ -38,7 +38,13 @@ def walk(frames: int) -> Trajectory:
 
 
 def make_run(
-    out: Path, frames: int = 300, points: int = 2000, truth: bool = True, seed: int = 0, slow_ms: float = 1.0
+    out: Path,
+    frames: int = 300,
+    points: int = 2000,
+    truth: bool = True,
+    seed: int = 0,
+    slow_ms: float = 1.0,
+    tag: bool = False,
 ) -> dict[str, Any]:
     """Write an out folder of a 30 Hz run and return its metrics; slow_ms scales the made-up timings."""
     rng = np.random.default_rng(seed)
@@ -83,5 +89,5 @@ def make_run(
             wall_s=0.62 * recording_s + 4.2,
             compile_s=4.2,
             recording_s=recording_s,
-            tags=[Tag("qr", "T07", 0.2, world @ SE3(np.eye(3), np.array([1.0, 2.9, 1.4])))],
+            tags=[Tag("qr", "T07", 0.2, world @ SE3(np.eye(3), np.array([1.0, 2.9, 1.4])))] if tag else [],
         )

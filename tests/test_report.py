@@ -59,7 +59,7 @@ def drawn(dom):
 
 @pytest.mark.parametrize("truth", [True, False])
 def test_the_page_draws_every_plot_without_error_or_request(tmp_path, truth):
-    make_run(tmp_path / "out", truth=truth)
+    make_run(tmp_path / "out", truth=truth, tag=True)
     dom, console, asked = browse(tmp_path / "out" / "report.html", tmp_path / "profile")
     assert faults(console) == []
     assert asked == set()

@@ -35,11 +35,11 @@ def packed(values: AnyArray) -> dict[str, str]:
     return {"dtype": "f4", "bdata": base64.b64encode(np.asarray(values, dtype="<f4").tobytes()).decode("ascii")}
 
 
-def thinned(count: int, worst: Array | None = None) -> AnyArray:
-    """Rows to draw of `count`: at most MAX_SAMPLES, evenly spread, of each stretch the one that is worst."""
-    if count <= MAX_SAMPLES:
+def thinned(count: int, worst: Array | None = None, most: int = MAX_SAMPLES) -> AnyArray:
+    """Rows to draw of `count`: at most `most`, evenly spread, of each stretch the one that is worst."""
+    if count <= most:
         return np.arange(count)
-    edges = np.linspace(0, count, MAX_SAMPLES + 1).astype(int)[:-1]
+    edges = np.linspace(0, count, most + 1).astype(int)[:-1]
     if worst is None:
         return edges
     ends = np.append(edges[1:], count)
@@ -134,7 +134,7 @@ def biases(run: RunFolder, kind: str, unit: str, per: float) -> Figure | None:
         value, sigma = run.column(f"bias_{kind}_{axis}"), run.column(f"sigma_bias_{kind}_{axis}")
         if value is None or sigma is None:
             return None
-        rows = thinned(len(value[0]))
+        rows = thinned(len(value[0]), most=MAX_SAMPLES // 4)  # they change slowly
         t_s, middle, off = value[0][rows], per * value[1][rows], per * sigma[1][rows]
         for y, fill in ((middle - off, "none"), (middle + off, "tonexty")):
             band = {"fill": fill, "fillcolor": f"{colour}30", "showlegend": False, "hoverinfo": "skip"}
