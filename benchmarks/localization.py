@@ -302,9 +302,10 @@ def memory(given: argparse.Namespace) -> None:
     """There and back again through the recording, so that the camera never jumps."""
     map = load_map(given.run / "map.lode")
     query = open_source(given.query)
-    frames = [Frame(f.t_ns, f.images[:1]) for f in query.messages("mono", end_s=given.end)]
+    rig, small = shrunk(query.rig, query.messages("mono", given.start, given.end), given.scale)
+    frames = [Frame(f.t_ns, f.images[:1]) for f in small]
     step_ns = int(np.median(np.diff([f.t_ns for f in frames])))
-    localizer = Localizer(query.rig, map, with_settings(LocalizerConfig(), given.set))
+    localizer = Localizer(rig, map, with_settings(LocalizerConfig(), given.set))
     there_and_back = [*frames, *frames[-2:0:-1]]
     per_minute = round(60e9 / step_ns)
     for i in range(given.minutes * per_minute + 1):
@@ -349,7 +350,9 @@ def main() -> None:
     task("speed", speed, "query").add_argument("--keyframes", type=int, default=1000)
     parser = task("memory", memory, "run", "query")
     parser.add_argument("--minutes", type=int, default=30)
+    parser.add_argument("--start", type=float, default=0.0)
     parser.add_argument("--end", type=float, default=float("inf"))
+    parser.add_argument("--scale", type=float, default=1.0, help="of the query's images")
     given = arguments.parse_args()
     cv2.setNumThreads(1)
     given.work(given)

@@ -71,14 +71,18 @@ class Builder:
 
     @contextmanager
     def movable(self, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> Iterator[np.random.Generator]:
-        """Build a thing at (x, y, z), or beside it if the building has changed; yields the thing's own generator."""
+        """Build a thing at (x, y, z), or beside it if the building has changed; yields what decides on its contents.
+
+        A changed building has other contents everywhere, also in what has not moved, as goods and books are turned over.
+        """
         self._items += 1
         chance = self.random(f"change {self._items}")
         moved = self.changed and chance.random() < MOVED_SHARE
         if moved:
             x, y, yaw_deg = self._beside(x, y, yaw_deg, chance)
-        rng = self.random(f"item {self._items}", int(moved))
-        before, self.mesh.rng = self.mesh.rng, rng
+        own = self.random(f"item {self._items}", int(moved))
+        rng = self.random(f"item {self._items}", 1) if self.changed and not moved else own
+        before, self.mesh.rng = self.mesh.rng, own
         try:
             with self.mesh.at(x, y, z, yaw_deg):
                 yield rng
