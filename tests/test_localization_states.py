@@ -18,7 +18,7 @@ S = 10**9
 
 def followed(**config):
     states = States(StatesConfig(**config))
-    states.found(0)
+    states.found(0, 200)
     return states
 
 
@@ -80,7 +80,7 @@ def test_a_way_without_any_known_distance_is_borne_with_for_half_a_metre():
 
 def test_without_temporary_points_the_camera_is_followed_down_to_n2():
     states = States(StatesConfig(), carrying=False)
-    states.found(0)
+    states.found(0, 200)
     assert judged(states, [(60, 60)] * 5 + [(20, 20)] * 2) == [Step.keep] * 5 + [Step.unsure, Step.lost]
 
 

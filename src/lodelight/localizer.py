@@ -26,7 +26,9 @@ from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu, LightFix, 
 from lodelight.rig import Rig
 from lodelight.types import Array
 
-DRIFT = 0.02  # of the way without the map, one standard deviation; science note B3
+# Of the way without the map, one standard deviation, by a camera of that focal length (science note B3): scale is lost
+# by angles, and with fewer pixels a radian they are measured the worse.
+DRIFT, DRIFT_FOCAL_PX = 0.02, 460.0
 GUESSED = 0.5  # of the way without anything whose distance is known
 
 
@@ -163,7 +165,8 @@ class Localizer:
         total = tracked.covariance + carried_covariance(self.map.pose(tracked.reference), known, tracked.T_world_body)
         if self.ladder.states.state is State.carried:
             states = self.ladder.states
-            total[3:, 3:] += ((DRIFT * states.carried_m) ** 2 + (GUESSED * states.guessed_m) ** 2) * np.eye(3)
+            drift_m = DRIFT * DRIFT_FOCAL_PX / self.ladder.follower.camera.focal_px * states.carried_m
+            total[3:, 3:] += (drift_m**2 + (GUESSED * states.guessed_m) ** 2) * np.eye(3)
         return total
 
 

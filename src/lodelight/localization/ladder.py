@@ -346,7 +346,8 @@ class Ladder:
             self.follower.forget()  # else the motion since then is worth knowing
         self.follower.accept(tracked)
         self.temporary.forget_past()
-        self.states.found(tracked.t_ns)
+        self.temporary.remember(tracked, tracked.right_in_map >= self.config.states.good_inliers)
+        self.states.found(tracked.t_ns, tracked.right_in_map)
         self.status, self.why = "relocalized", f"{why}; {tracked.right_in_map} on a second look"
         self.emit(tracked.t_ns, "relocalization", why=self.why, inliers=tracked.n_inliers)
         return tracked

@@ -75,10 +75,10 @@ class States:
         self._found_ns = 0
         self._held_ns = 0  # when the map last held the pose, if only just
 
-    def found(self, t_ns: int) -> None:
-        """The camera was found."""
+    def found(self, t_ns: int, in_map: int) -> None:
+        """The camera was found; in_map : points of the map that agree with its pose."""
         self.state, self.why = State.following, ""
-        self.poor = self.weak = 0
+        self.poor, self.weak = int(in_map < self.config.good_inliers), 0
         self._found_ns = t_ns
 
     def judge(

@@ -177,22 +177,18 @@ class TemporaryPoints:
         self._from_depth(tracked)
         self._measure(self._past if tracked.guessed else [*self._past, self._past_of(tracked, False)])
         for past in self._partners(tracked) if not tracked.guessed else ():
-            known = np.count_nonzero((tracked.point >= 0) | self.measured(tracked.temporary))
-            if known >= self.config.enough or len(self) >= self.config.most:
+            if tracked.measured + self.created - before >= self.config.enough or len(self) >= self.config.most:
                 break
             self._triangulate(tracked, past)
-        self._suppose(tracked, distance_m)
+        self._suppose(tracked, distance_m, self.config.enough - tracked.right_in_all - (self.created - before))
         return self.created - before
-
-    def _matched(self, tracked: Tracked) -> int:
-        return int(np.count_nonzero(_taken(tracked.point, tracked.temporary)))
 
     def _from_depth(self, tracked: Tracked) -> None:
         """Where a sensor has measured the depth, one frame is enough."""
         seen = tracked.seen
         close = (seen.inv_depth > 0) & (seen.sigma_inv_depth < CLOSE_SIGMA * seen.inv_depth)
         rows = np.flatnonzero(close & ~_taken(tracked.point, tracked.temporary))
-        rows = rows[: max(self.config.enough - self._matched(tracked), 0)]
+        rows = rows[: max(self.config.enough - tracked.right_in_all, 0)]
         if len(rows):
             T_world_cam = tracked.T_world_body @ self.spec.T_body_cam
             xyz = T_world_cam @ (seen.ray[rows] / (seen.ray[rows, 2] * seen.inv_depth[rows])[:, None])
@@ -251,7 +247,7 @@ class TemporaryPoints:
                         break
         return chosen
 
-    def _suppose(self, tracked: Tracked, distance_m: Array) -> None:
+    def _suppose(self, tracked: Tracked, distance_m: Array, wanted: int) -> None:
         """Points as far away as others are, of what nothing explains: they hold the direction of a camera that turns
         on the spot, where nothing has parallax, and count for less the farther it has moved from where it saw them."""
         assert tracked.temporary is not None
@@ -261,7 +257,7 @@ class TemporaryPoints:
         if len(distances) >= ENOUGH_DISTANCES:
             self._usual_m = float(np.median(distances))
         rows = np.flatnonzero(~_taken(tracked.point, tracked.temporary))
-        rows = rows[: max(min(self.config.enough - self._matched(tracked), self.config.most - len(self)), 0)]
+        rows = rows[: max(min(wanted, self.config.most - len(self)), 0)]
         if self._usual_m is None or len(rows) == 0:
             return
         seen = tracked.seen.take(rows)

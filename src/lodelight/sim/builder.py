@@ -73,7 +73,7 @@ class Builder:
     def movable(self, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> Iterator[np.random.Generator]:
         """Build a thing at (x, y, z), or beside it if the building has changed; yields what decides on its contents.
 
-        A changed building has other contents everywhere, also in what has not moved, as goods and books are turned over.
+        A changed building has other contents also in what has not moved, as goods and books are turned over.
         """
         self._items += 1
         chance = self.random(f"change {self._items}")
