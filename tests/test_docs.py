@@ -35,7 +35,7 @@ ONLY_CHECKED = {
     "bench": "test_bench", "doctor": "test_doctor", "tags map": "test_slam_tags", "run 0": "test_camera",
     "--view": "test_view", "--web": "test_view", "--scheduler": "test_fleet", "mono-inertial": "test_inertial_odometry",
     "run office": "test_light_gate", "recordings/office": "renders for longer", "fleet": "test_fleet",
-    "--format grid": "test_cli_map",
+    "--format grid": "test_cli_map", "--sensors mono --out": "test_first_views", "eval out/mono": "test_first_views",
 }  # fmt: skip
 
 

@@ -19,9 +19,10 @@ from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.inertial import InertialFront, Located, NewKeyframe
 from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording, woven
-from lodelight.localization.machine import LocalizationMachine
+from lodelight.localization.machine import Finder, LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
 from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
+from lodelight.mapping.first_views import Begun, FirstViews, FirstViewsConfig
 from lodelight.mapping.inertial_adjust import adjust_with_imu
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
 from lodelight.mapping.light_anchor import LightAnchor
@@ -42,6 +43,7 @@ from lodelight.types import Array
 
 EventSink = Callable[..., None]  # called as sink(t_ns, kind, **fields)
 FOREVER_NS = 10**18
+GIVEN_UP_NS = 10**9  # sooner than this no map is given up
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class SlamConfig:
     final_iterations: int = 10
     orb: OrbConfig = field(default_factory=OrbConfig)
     tracking: TrackerConfig = field(default_factory=TrackerConfig)
+    first_views: FirstViewsConfig = field(default_factory=FirstViewsConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     mapping: LocalMappingConfig = field(default_factory=LocalMappingConfig)
     loops: LoopConfig = field(default_factory=LoopConfig)
@@ -80,13 +83,14 @@ MappingJob: TypeAlias = int | FlownKeyframe  # a keyframe of the map, or one tha
 
 
 class Slam:
-    """Simultaneous localization and mapping with RGB-D or stereo, or with any camera and an IMU.
+    """Simultaneous localization and mapping with RGB-D or stereo, with any camera and an IMU, or with one camera alone.
 
     `run` streams a recording; `feed` takes one message at a time, for live use; `close` waits for mapping to end.
     map : the map so far; a given one is continued
     live : mapping on its own thread; else everything is done in order, the same bytes every time
     anchors : what is surveyed of the building; fixes by its lights come as messages
     on_event : told of every decision, as on_event(t_ns, kind, **fields), from either thread
+    metric : lengths are in m; not so of one camera alone, unless a tag of known size was in view when the map began
     mapping_ms : wall time of every keyframe's mapping so far
     localization_only : set it, and the map is no longer written to
     """
@@ -102,21 +106,14 @@ class Slam:
         anchors: Anchors | None = None,
     ) -> None:
         self.config = config or SlamConfig()
-        _check_sensors(self.config.sensors, known=map is not None)
-        self.map = map if map is not None else Map(rig)
         visual, _, inertial = self.config.sensors.partition("-")
         self.front_end = FrontEnd(rig, visual, self.config.orb)
-        self.tracker = Tracker(rig, self.map, self.config.orb, self.config.tracking, self.config.seed)
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
-        self.lights = _light_anchor(self.map, self.config, anchors or Anchors(), self.emit)
-        self.gates = (*gates, self.lights.ask) if self.lights and self.config.gate.use == "lights" else gates
-        places = Places(self.map)
-        find = Relocalizer(self.map, self.config.orb, places).find
-        self.machine = LocalizationMachine(self.tracker, find)
-        self.mapper = LocalMapper(self.map, self.config.orb, self.config.mapping)
-        self.loops = LoopCloser(self.map, self.config.orb, places, self.config.loops, self.emit)
-        known = anchors.tags if anchors is not None else ()
-        self.tags = MapTags(self.map, self.config.orb, self.config.mapping.sigma_px, known, self.config.tags, self.emit)
+        self.anchors, self.more_gates = anchors or Anchors(), gates
+        find = self._assemble(map if map is not None else Map(rig))
+        scaleless = visual == "mono" and not inertial and map is None
+        self.first_views = self._first_views() if scaleless else None
+        self.metric = not scaleless
         self.inertial: InertialFront | None = None
         if inertial:
             odometry = InertialOdometry(rig, visual, self.config.inertial, self.emit, self.config.seed)
@@ -129,7 +126,6 @@ class Slam:
         work: Callable[[MappingJob], None] = self._map
         self.mapping = ThreadedMapping(work) if live else InlineMapping(work)
         self.mapping_ms: list[float] = []
-        self.path: list[PathNode] = []
         self.relocalizations = 0
         self.dropped = 0
         self._last_keyframe_ns = -FOREVER_NS
@@ -192,7 +188,7 @@ class Slam:
         """One frame: see it, locate it, decide whether it becomes a keyframe, map."""
         clock = Stopwatch()
         seen = self.front_end.process(frame)
-        tags = self.tags.see(frame)
+        tags = self.tags.see(frame) if self.metric or len(self.map.keyframes) == 0 else []  # they say lengths
         if len(self.map.keyframes) == 0:
             return self._begin(frame.t_ns, seen, clock, tags)
         with self.map.lock:
@@ -216,6 +212,15 @@ class Slam:
                 with self.map.lock:
                     covariance = self._covariance(tracked)
                     self.tags.note(tags, tracked.reference, tracked.T_reference_body, covariance, own=False)
+        elif self.first_views is not None and self._hopeless(frame.t_ns):
+            self.emit(
+                frame.t_ns,
+                "begun_anew",
+                why="lost for longer than the map had been followed",
+                keyframes=len(self.map.keyframes),
+            )
+            self._assemble(Map(self.map.rig))
+            self.first_views = self._first_views()
         return estimate
 
     def trajectory(self) -> Trajectory:
@@ -237,6 +242,7 @@ class Slam:
             "loops": len(self.map.loops),
             "tags": int(np.count_nonzero(self.map.tags.placed)),
             "aligned": self.tags.aligned,
+            "metric": self.metric,
             "relocalizations": self.relocalizations + (self.inertial.relocalizations if self.inertial else 0),
             "dropped": self.dropped,
             **({"gate": self.lights.gate.counts} if self.lights else {}),
@@ -248,6 +254,28 @@ class Slam:
 
     # -- parts --------------------------------------------------------------------------------------------------
 
+    def _assemble(self, map: Map) -> Finder:
+        """Everything that works on a map, around this one; returns what finds a camera in it."""
+        orb, config = self.config.orb, self.config
+        self.map = map
+        self.tracker = Tracker(map.rig, map, orb, config.tracking, config.seed)
+        self.lights = _light_anchor(map, config, self.anchors, self.emit)
+        gated = self.lights is not None and config.gate.use == "lights"
+        self.gates = (*self.more_gates, self.lights.ask) if self.lights and gated else self.more_gates
+        places = Places(map)
+        find = Relocalizer(map, orb, places).find
+        self.machine = LocalizationMachine(self.tracker, find)
+        self.mapper = LocalMapper(map, orb, config.mapping)
+        self.loops = LoopCloser(map, orb, places, config.loops, self.emit)
+        self.tags = MapTags(map, orb, config.mapping.sigma_px, self.anchors.tags, config.tags, self.emit)
+        self.path: list[PathNode] = []
+        return find
+
+    def _first_views(self) -> FirstViews:
+        config, spec = self.config, self.map.rig.cameras[0]
+        self.mapper.min_parallax = math.radians(config.mapping.min_parallax_mono_deg)
+        return FirstViews(spec, config.orb, config.mapping.sigma_px, config.first_views, config.seed)
+
     def _move_map(self) -> None:
         """Lay the map down where the lights say it is, while no adjustment is under way that would move it back."""
         move = self.lights.take_move() if self.lights and self.mapping.idle else None
@@ -256,8 +284,20 @@ class Slam:
             self.tags.moved()
             self.loops.forget()
 
+    def _hopeless(self, t_ns: int) -> bool:
+        """Whether a map without scale is given up for a new one: it was followed for less time than it is lost now."""
+        if not self.path or not self.mapping.idle:
+            return False
+        followed_ns, lost_ns = self.path[-1].t_ns - self.path[0].t_ns, t_ns - self.path[-1].t_ns
+        return lost_ns > max(followed_ns, GIVEN_UP_NS)
+
     def _begin(self, t_ns: int, seen: Features, clock: Stopwatch, tags: Sequence[TagSighting]) -> Estimate:
         """The first keyframe of a new map, at the origin, if enough of what it sees has a depth."""
+        if self.first_views is not None:
+            begun = self.first_views.feed(t_ns, seen, tags)
+            if not isinstance(begun, str):
+                return self._begin_with(begun, clock)
+            return Estimate(t_ns, "initializing", SE3.identity(), LOST_COVARIANCE, begun, 0, {"track_ms": clock.ms()})
         close = int(np.count_nonzero(self.mapper.close(seen)))
         if close < self.config.min_start_points:
             why = f"{close} of {len(seen)} corners have depth, {self.config.min_start_points} are needed to begin a map"
@@ -274,6 +314,25 @@ class Slam:
         if self.lights:
             self.lights.tracked(t_ns, 0, SE3.identity())
         return self._estimate(first, clock)
+
+    def _begin_with(self, begun: Begun, clock: Stopwatch) -> Estimate:
+        """Several keyframes and the points that they see; without a tag the map is as large as was supposed."""
+        self.metric = begun.metric
+        with self.map.lock:
+            keyframes: list[int] = []
+            for view in begun.views:
+                nothing, parent = np.full(len(view.seen), -1, np.int32), len(keyframes) - 1
+                keyframes.append(self.mapper.insert(view.t_ns, view.T_world_body, view.seen, nothing, 1.0, parent))
+                self.emit(view.t_ns, "keyframe", inserted=True, why="of the first views", weight=1.0)
+                self.path.append(PathNode(view.t_ns, keyframes[-1], SE3.identity()))
+            self.mapper.add_seen(begun.xyz, keyframes, [view.row for view in begun.views])
+            point = self.map.points_of(keyframes[-1]).copy()
+        last = begun.views[-1]
+        tracked = Tracked(last.t_ns, last.seen, last.T_world_body, np.zeros((6, 6)), point, reference=keyframes[-1])
+        self._last_keyframe_ns = last.t_ns
+        self.machine.start(tracked)
+        self.mapping.submit(keyframes[-1])
+        return self._estimate(tracked, clock)
 
     def _take(self, located: Located) -> Estimate:
         """What the inertial half made of a frame: into the path, and its keyframe to mapping."""
@@ -357,6 +416,7 @@ class Slam:
             mapping_idle=self.mapping.idle,
             mapping_stopped=self.loops.correcting,
             localization_only=self.localization_only,
+            measures_depth=self.config.sensors != "mono",
             queue=self.mapping.queued,
             T_world_body=tracked.T_world_body,
             covariance=self._covariance(tracked),
@@ -376,18 +436,13 @@ class Slam:
         )  # fmt: skip
 
 
-def _check_sensors(sensors: str, known: bool) -> None:
-    if sensors == "mono" and not known:
-        raise ConfigError(
-            "mono alone gives a map no scale; choose rgbd, stereo or mono-inertial, or give a map with --map"
-        )
-
-
 def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSink) -> LightAnchor | None:
     """None where lights are not asked for. Raises ConfigError where they would be used twice."""
     gated, tight = config.gate.use == "lights", config.lights.use == "tight"
     if gated and tight:
         raise ConfigError("the gate and tight lights would count the same light twice; choose --gate or --lights tight")
+    if (gated or tight) and config.sensors == "mono" and len(map.keyframes) == 0:
+        raise ConfigError("lights say metres, and one camera alone does not; choose rgbd, stereo, or one with an IMU")
     if tight and (map.rig.lights is None or not anchors.lights):
         raise ConfigError("tight lights need a light camera in the rig and [[light]] entries in the anchors")
     if not gated and not tight:

@@ -30,7 +30,7 @@ def run(
     source: Path = typer.Argument(..., help="A recording of any known format, or the number of a camera."),
     out: Path = typer.Option(..., help="Folder for trajectory, map, report; created."),
     sensors: str = typer.Option(
-        "", help="stereo, rgbd, or mono-, stereo-, rgbd-inertial; default: the most the source has."
+        "", help="mono, stereo, rgbd, or one of them with -inertial; default: the most the source has."
     ),
     rig: Path = typer.Option(None, help="rig.toml, or a calibration file of another tool."),
     anchors: Path = typer.Option(None, help="anchors.toml: what is surveyed of the building."),
@@ -154,7 +154,7 @@ def slam_to_folder(
             slam.trajectory(), slam.cloud(), {**slam.stats(), "skipped": len(recording.skipped)},
             recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
             recording_s=(last_ns - (first_ns or last_ns)) * 1e-9,
-            align="none" if slam.tags.aligned else upright, tags=slam.tags.found(),
+            align="none" if slam.tags.aligned else upright if slam.metric else "sim3", tags=slam.tags.found(),
         )  # fmt: skip
 
 

@@ -113,10 +113,12 @@ def _search_near(
         x1 = min(math.floor((px[i, 0] + r) / CELL_PX), columns - 1)
         y0 = max(math.floor((px[i, 1] - r) / CELL_PX), 0)
         y1 = min(math.floor((px[i, 1] + r) / CELL_PX), rows - 1)
+        if x1 < x0:
+            continue
         best, best_distance = -1, max_hamming + 1
         second_distance, second_octave = 257, -1
         for y in range(y0, y1 + 1):
-            for at in range(start[y * columns + x0], start[y * columns + x1 + 1] if x1 >= x0 else 0):
+            for at in range(start[y * columns + x0], start[y * columns + x1 + 1]):
                 j = order[at]
                 if not free[j] or f_octave[j] < octave_min[i] or f_octave[j] > octave_max[i]:
                     continue

@@ -64,12 +64,14 @@ def triangulate_pairs(
     rays_b: AnyArray,
     sigma_b: AnyArray,
     max_relative_sigma: float = 0.2,
+    min_parallax: float = 0.0,
 ) -> tuple[Array, Bools]:
     """World points (N, 3) m from rays matched between two cameras, and which of them are to be trusted.
 
     rays_a, rays_b : (N, 3) unit vectors in their own camera's frame; sigma_a, sigma_b : (N,) rad
     Trusted: ahead of both cameras, the rays meet within the 95 % bound of their noise, and the distance is known to
-    better than `max_relative_sigma` of itself, which is a bound on the parallax in units of the noise.
+    better than `max_relative_sigma` of itself, which is a bound on the parallax in units of the noise; the parallax
+    itself is at least `min_parallax` rad, for where the cameras' own places are in doubt.
     """
     n = len(rays_a)
     centres, rays, sigma = np.empty((n, 2, 3)), np.empty((n, 2, 3)), np.empty((n, 2))
@@ -77,6 +79,7 @@ def triangulate_pairs(
         centres[:, k], rays[:, k], sigma[:, k] = T.t, f @ T.R.T, s
     found = triangulate_rays(centres.reshape(-1, 3), rays.reshape(-1, 3), sigma.ravel(), np.arange(0, 2 * n + 1, 2))
     good = found.in_front & (found.chi2 < CHI2_PAIR) & (found.relative_sigma < max_relative_sigma)
+    good &= found.parallax >= min_parallax
     return found.xyz, good
 
 

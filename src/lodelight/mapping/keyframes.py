@@ -19,7 +19,8 @@ from lodelight.types import Array
 @dataclass(frozen=True)
 class KeyframeConfig:
     """max_interval_s : one is inserted after this long even if mapping is busy; min_interval_s : never sooner
-    overlap : the share of the reference keyframe's points above which a frame adds nothing new
+    overlap : the share of the reference keyframe's points above which a frame adds nothing new; overlap_mono : where
+        no depth is measured, and new points need two keyframes
     weak_overlap : the share below which one is inserted whatever the timing (if weak_tracking_override)
     min_points : with fewer tracked points a frame is not trusted to become one
     max_noise : a frame whose corners are noisier than a sharp one's by more waits for a sharper one, if it can
@@ -31,6 +32,7 @@ class KeyframeConfig:
     max_interval_s: float = 1.0
     min_interval_s: float = 0.0
     overlap: float = 0.8
+    overlap_mono: float = 0.9
     overlap_young: float = 0.4
     weak_overlap: float = 0.25
     weak_tracking_override: bool = True
@@ -65,6 +67,7 @@ class Candidate:
     queue: int = 0
     mapping_stopped: bool = False
     localization_only: bool = False
+    measures_depth: bool = True
     T_world_body: SE3 = field(default_factory=SE3.identity)
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -120,7 +123,7 @@ def blurred(c: Candidate, config: KeyframeConfig) -> str:
 
 
 def overlap_too_high(c: Candidate, config: KeyframeConfig) -> str:
-    limit = config.overlap_young if c.n_keyframes < 2 else config.overlap
+    limit = config.overlap_young if c.n_keyframes < 2 else config.overlap if c.measures_depth else config.overlap_mono
     if c.inliers >= limit * c.reference_points and not needs_close_points(c, config):
         return f"{c.inliers} of the reference's {c.reference_points} points still in view"
     return ""

@@ -8,7 +8,7 @@ neighbourhood are adjusted together, and keyframes that add nothing go.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,8 @@ class LocalMappingConfig:
     window : keyframes adjusted together; min_shared : points that make a keyframe part of it
     redundant : share of a keyframe's points that others see as well, above which it is culled
     found_ratio : a point found in a smaller share of the frames that should see it is culled
+    min_parallax_mono_deg : of corners that make a point where no sensor tells the scale: with less, the errors of two
+        poses pass for parallax, and a camera that turns on the spot shrinks its world
     iterations : of the adjustment at a keyframe; the next keyframe's goes on where it ended
     """
 
@@ -50,6 +52,7 @@ class LocalMappingConfig:
     min_shared: int = 15
     redundant: float = 0.9
     found_ratio: float = 0.25
+    min_parallax_mono_deg: float = 1.15
     iterations: int = 5
 
 
@@ -63,6 +66,7 @@ class LocalMapper:
         self.camera = map.rig.cameras[0].camera
         self.T_body_cam = map.rig.cameras[0].T_body_cam
         self.hold_poses = False  # keyframes stay where they were put; only points are adjusted
+        self.min_parallax = 0.0  # rad, of corners that make a point
         self._young: list[tuple[int, Ints]] = []  # keyframe and the points it made, until they have proved themselves
 
     # -- the two halves -----------------------------------------------------------------------------------------
@@ -96,6 +100,19 @@ class LocalMapper:
         self._adjust(keyframe, stop)
         with self.map.lock:
             self._cull_keyframes(keyframe)
+
+    def add_seen(self, xyz: Array, keyframes: Sequence[int], rows: Sequence[AnyArray]) -> Ints:
+        """New points (M, 3) m, and for every keyframe the corner (M,) of it that sees each, -1 = none; returns ids.
+
+        The first keyframe sees all of them.
+        """
+        map = self.map
+        points = map.add_points(xyz, (map.feature_range(keyframes[0]).start + rows[0]).astype(np.int32), keyframes[0])
+        for keyframe, row in zip(keyframes[1:], rows[1:], strict=True):
+            sees = row >= 0
+            map.link((map.feature_range(keyframe).start + row[sees]).astype(np.int32), points[sees])
+        map.refresh_points(points, self.orb.scale_factor, self.orb.n_levels)
+        return points
 
     def close(self, seen: Features) -> Bools:
         """Which features have a depth good enough to make a point of it, or are among the best `min_close`."""
@@ -140,12 +157,10 @@ class LocalMapper:
             match = match_epipolar(a, b, T_world_b.inverse() @ T_world_a, sigma_b)
             ia = np.flatnonzero(match >= 0)
             ib = match[ia]
-            xyz, good = triangulate_pairs(T_world_a, a.ray[ia], sigma_a[ia], T_world_b, b.ray[ib], sigma_b[ib])
-            row_a = (map.feature_range(keyframe).start + free[ia[good]]).astype(np.int32)
-            row_b = (map.feature_range(other).start + free_there[ib[good]]).astype(np.int32)
-            points = map.add_points(xyz[good], row_a, keyframe)
-            map.link(row_b, points)
-            map.refresh_points(points, self.orb.scale_factor, self.orb.n_levels)
+            xyz, good = triangulate_pairs(
+                T_world_a, a.ray[ia], sigma_a[ia], T_world_b, b.ray[ib], sigma_b[ib], min_parallax=self.min_parallax
+            )
+            points = self.add_seen(xyz[good], (keyframe, other), (free[ia[good]], free_there[ib[good]]))
             made.append(points)
         if made:
             self._young.append((keyframe, np.concatenate(made)))
