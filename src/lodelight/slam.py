@@ -302,9 +302,7 @@ class Slam:
         if close < self.config.min_start_points:
             why = f"{close} of {len(seen)} corners have depth, {self.config.min_start_points} are needed to begin a map"
             return Estimate(t_ns, "initializing", SE3.identity(), LOST_COVARIANCE, why, 0, {"track_ms": clock.ms()})
-        T_world_body, waiting = self.lights.start(t_ns) if self.lights else (SE3.identity(), "")
-        if waiting:
-            return Estimate(t_ns, "initializing", T_world_body, LOST_COVARIANCE, waiting, 0, {"track_ms": clock.ms()})
+        T_world_body = self.lights.start(t_ns) if self.lights else SE3.identity()
         nothing = np.full(len(seen), -1, np.int32)
         first = Tracked(t_ns, seen, T_world_body, np.zeros((6, 6)), nothing, reference=0)
         self.emit(t_ns, "keyframe", inserted=True, why="the first", weight=1.0)

@@ -32,8 +32,7 @@ CLOCK_EVERY = 10  # fixes
 FLOOR_RAD, FLOOR_M = math.radians(0.05), 0.003  # of a pose by the lights: what its covariance does not know of
 HELD_S = 0.2
 MOTION_SHARE = 0.5  # of the gate's thresholds: fixes' motion within a second is better known than their place
-WAIT_S = 0.15  # that a map waits for the lights before it begins: one image of theirs
-NOT_YET = "the map's place in the world rests on less than ten fixes of three lights"
+NOT_YET = "the map's place in the world rests on less than ten fixes, and on less than three lights passed"
 
 
 class LightAnchor:
@@ -66,7 +65,6 @@ class LightAnchor:
         self._why_none = "no light seen yet"
         self._verdict: tuple[int, Verdict, LightPose] | None = None
         self._pending: SE3 | None = None
-        self._asked_ns: int | None = None
         self._tied_ns: int | None = None  # the last keyframe that a pose by the lights holds
         self._doubted_ns = self._held_ns = -(10**18)
 
@@ -152,17 +150,15 @@ class LightAnchor:
             return None, "one of its lights is not where it was surveyed"
         return here, ""
 
-    def start(self, t_ns: int) -> tuple[SE3, str]:
-        """T_world_body to begin a map with, and why it should not begin yet; the identity where no light is in view."""
-        self._asked_ns = t_ns if self._asked_ns is None else self._asked_ns
+    def start(self, t_ns: int) -> SE3:
+        """T_world_body to begin a map with: where the lights say, or the identity until they do."""
         here, fix = self._buffer.at(t_ns), self._buffer.before(t_ns, REACH_S)
         T = here.T_world_body if here is not None else fix.T_world_body if fix is not None else None
-        if T is not None:
-            self._placement.placed = True
-            self.emit(t_ns, "world", why="the map begins where the lights say", pairs=1, moved_m=0.0, turned_deg=0.0)
-            return T, ""
-        waited_s = (t_ns - self._asked_ns) * NS
-        return SE3.identity(), "waits for a first pose by the lights" if waited_s < WAIT_S else ""
+        if T is None:
+            return SE3.identity()
+        self._placement.placed = True
+        self.emit(t_ns, "world", why="the map begins where the lights say", pairs=1, moved_m=0.0, turned_deg=0.0)
+        return T
 
     def doubt(self, t_ns: int, T_world_body: SE3 | None) -> Doubt | None:
         """Where to look for a frame that was lost, or tracked farther from the lights' pose than the gate allows."""
