@@ -22,7 +22,7 @@ from lodelight.types import Array
 # Limits: half of what spoils a run, and above what good recordings of known rigs show (docs/doctor.md).
 OFFSET_MS, TURN_DEG, FOCAL, EPIPOLAR_PX, AIM_CM, REGION_PX = 3.5, 1.3, 0.018, 1.0, 1.0, 1.0
 SHIFT_CM, SQUARE_PX, ASPECT = 2.0, 1.0, 0.015
-SURE = 2.5  # sigmas that know how alike errors are (`findings.jackknifed`); others are believed at four
+SURE = 2.5  # sigmas of a time offset, which know how alike errors are (`findings.jackknifed`); others need four
 DEGREES = (40.0, 80.0)  # what a gyro in degrees shows over what vision does
 
 
@@ -195,7 +195,6 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             "IMU turn", turn_deg, sigma_deg, TURN_DEG, "deg",
             "cam0 stands to the IMU as the rig says, to {value:.2f} deg (+- {sigma:.2f})",
             "extrinsics: cam0 is turned by {value:.2f} deg (+- {sigma:.2f}) against the IMU; calibrate T_body_cam anew",
-            times=SURE,
         )
     )  # fmt: skip
     out.append(
@@ -203,7 +202,6 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
             "focal length", 100 * (found.scale - 1), 100 * found.sigma_scale, 100 * FOCAL, "%",
             "images turn as the gyro does, to {value:.2f} % (+- {sigma:.2f})",
             "focal length: the true one is {value:+.1f} % (+- {sigma:.1f}) off the rig's, by the gyro; calibrate anew",
-            times=SURE,
         )
     )  # fmt: skip
     if any(f.level == "fault" for f in out):

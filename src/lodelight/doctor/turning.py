@@ -174,7 +174,8 @@ class Alignment:
 
     offset_s : is to be added to the stamps of images; turn_rad : (3,) R_body_cam = rig's Exp(turn_rad), by camera axes
     scale : of visual angles about axes across the optical one over the gyro's: true focal length over the rig's
-    sigma_... : standard deviations, scaled to the residuals' spread; residual_rad : that spread; pairs : used
+    sigma_... : standard deviations, scaled to the residuals' spread; that of the offset, which one turn of the body
+    may pretend, is no less than what leaving out BLOCK_S at a time does to it; residual_rad : that spread; pairs : used
     rate_ratio, correlation : of the speeds of turning, vision to gyro; bias : (3,) rad/s of the gyro
     """
 
@@ -249,12 +250,12 @@ def _fine(
         if abs(fit.x[0]) < 2e-4:
             break
     spread = max(1.0, 1.4826 * float(np.median(np.abs(residual(fit.x)))))
-    block = (0.5 * (a_s + b_s) // BLOCK_S).astype(int)
+    sigma = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac))) * spread
     r = residual(fit.x)
     J = np.column_stack([(residual(fit.x + d) - r) / 1e-6 for d in 1e-6 * np.eye(8)])
     weight = np.minimum(1.0, HUBER / np.maximum(np.abs(r), 1e-12))
-    by_blocks = jackknifed(J, weight, r, np.repeat(block, 3))
-    sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * spread**2, np.diag(by_blocks)))
+    by_blocks = jackknifed(J, weight, r, np.repeat((0.5 * (a_s + b_s) // BLOCK_S).astype(int), 3))
+    sigma[0] = max(sigma[0], float(np.sqrt(by_blocks[0, 0])))
     turned = (middle + slope * fit.x[0] - fit.x[4:7] * length) @ (R_body_cam @ so3_exp(fit.x[1:4]))
     left = 1.4826 * float(np.median(np.abs(vision - turned)))
     return Alignment(
