@@ -124,3 +124,13 @@ def test_pycolmap_reads_the_model_and_agrees_on_its_error(
     model_read.update_point_3d_errors()
     assert abs(model_read.compute_mean_reprojection_error() - told) < 1e-3  # px, what the text is rounded to
     assert camera_line(map.rig.cameras[0].camera).startswith(model)
+
+
+def test_two_keyframes_of_one_stamp_are_two_images(tmp_path):
+    map = room_map()
+    map.keyframes.t_ns[3] = map.keyframes.t_ns[0]
+    export_colmap(map, tmp_path)
+    lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if line.endswith(".png")]
+    names = [line.split()[-1] for line in lines]
+    assert len(set(names)) == len(map.alive_keyframes)
+    assert f"{map.keyframes.t_ns[0]}_2.png" in names

@@ -172,3 +172,13 @@ def test_fusing_neighbours_points_into_a_keyframe_keeps_the_map_sound() -> None:
 
 def mapper_of(map: Map) -> tuple[Map, LocalMapper]:
     return map, LocalMapper(map, OrbConfig(), LocalMappingConfig())
+
+
+def test_joining_leaves_alone_what_the_keyframe_sees_elsewhere_and_what_is_dead():
+    map = room_map()
+    rows = np.flatnonzero((map.features.keyframe == 0) & (map.features.point >= 0))[:3]
+    first, second, third = map.features.point[rows].tolist()
+    map.remove_points([third])
+    map.join(rows[:2], [second, third])
+    assert map.features.point[rows].tolist() == [first, second, -1]
+    assert invariants.problems(map) == []

@@ -22,6 +22,7 @@ from lodelight.io.recording import Recording, woven
 from lodelight.localization.machine import Finder, LocalizationMachine
 from lodelight.localization.relocalize import Relocalizer
 from lodelight.localization.tracker import Tracked, Tracker, TrackerConfig
+from lodelight.mapping.compact import compacted
 from lodelight.mapping.first_views import Begun, FirstViews, FirstViewsConfig
 from lodelight.mapping.inertial_adjust import adjust_with_imu
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, KeyframeConfig, decide
@@ -229,6 +230,15 @@ class Slam:
             [node.t_ns for node in self.path],
             [self.tags.world(T) for T in laid_down(self.path, self.map.pose)],
         )
+
+    def map_in_world(self) -> Map:
+        """A copy of the map as it stands, without dead rows, in the world where it is aligned: what to save of a run
+        that goes on."""
+        with self.map.lock:
+            map, T_world_map = compacted(self.map), self.tags.T_world_map
+        if T_world_map is not None:
+            map.move(T_world_map)
+        return map
 
     def cloud(self) -> Array:
         """(N, 3) m, world: the map's points."""

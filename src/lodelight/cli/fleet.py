@@ -102,16 +102,10 @@ def run_one(job: Job) -> Outcome:
 
 
 def _run(job: Job, out: Path) -> dict[str, Any]:
-    from lodelight.cli.run import slam_to_folder
-    from lodelight.io.anchors_toml import read_anchors
-    from lodelight.io.sources import open_source
-    from lodelight.settings import with_settings
-    from lodelight.slam import SlamConfig
+    from lodelight.cli.run import prepared, slam_to_folder
 
     o = job.options
-    recording = open_source(job.source, o["rig"])
-    config = with_settings(SlamConfig(sensors=o["sensors"] or recording.rig.sensors, seed=o["seed"]), o["settings"])
-    anchors = read_anchors(o["anchors"]) if o["anchors"] else None
+    recording, config, anchors = prepared(job.source, o["rig"], o["anchors"], o["sensors"], o["seed"], o["settings"])
     return slam_to_folder(recording, out, config, anchors=anchors)
 
 

@@ -12,7 +12,7 @@ import typer
 from lodelight.cli.options import RRD_HELP, TOPIC_HELP, VIEW_HELP, WEB_HELP
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from lodelight.anchors import Anchors
     from lodelight.cli.watching import Watcher
@@ -53,18 +53,13 @@ def run(
     """SLAM over a recording: trajectory, map and report."""
     from lodelight.cli.watching import ViewOptions
     from lodelight.errors import ConfigError, RunError
-    from lodelight.io.anchors_toml import read_anchors
     from lodelight.io.rosbag_topics import parse_roles
     from lodelight.io.sources import open_source
     from lodelight.mapping.store import load_map
-    from lodelight.settings import with_settings
-    from lodelight.slam import SlamConfig
 
-    recording = open_source(source, rig, parse_roles(topic))
     asked = [f"gate.use={gate}", f"lights.use={lights}", *settings]
-    config = with_settings(SlamConfig(sensors=sensors or recording.rig.sensors, seed=seed), asked)
+    recording, config, surveyed = prepared(source, rig, anchors, sensors, seed, asked, topic)
     known = load_map(map_file) if map_file else None
-    surveyed = read_anchors(anchors) if anchors else None
     fixes: Iterable[LightFix] = ()
     if config.gate.use != "none" or config.lights.use != "off":
         again = open_source(source, rig, parse_roles(topic))
@@ -78,6 +73,22 @@ def run(
         watcher.stay()
     if metrics["tracked_fraction"] == 0.0:
         raise RunError(f"{source}: no frame could be localized; {out / 'events.jsonl'} says why")
+
+
+def prepared(
+    source: Path | str, rig: Path | None, anchors: Path | None, sensors: str, seed: int, settings: list[str],
+    topics: Sequence[str] = (),
+) -> tuple[Recording, SlamConfig, Anchors | None]:  # fmt: skip
+    """A recording, what is in force, and what is surveyed; sensors : empty = the most that the recording has."""
+    from lodelight.io.anchors_toml import read_anchors
+    from lodelight.io.rosbag_topics import parse_roles
+    from lodelight.io.sources import open_source
+    from lodelight.settings import with_settings
+    from lodelight.slam import SlamConfig
+
+    recording = open_source(source, rig, parse_roles(list(topics)))
+    config = with_settings(SlamConfig(sensors=sensors or recording.rig.sensors, seed=seed), settings)
+    return recording, config, read_anchors(anchors) if anchors else None
 
 
 def light_fixes(

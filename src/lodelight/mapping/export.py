@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,22 @@ def export_cloud(map: Map, out: Path, format: str) -> dict[str, Any]:
 
 
 def export_colmap(map: Map, folder: Path) -> dict[str, Any]:
-    """The living keyframes as images of camera 0 named by their stamps (`<t_ns>.png`), and the points they see."""
+    """The living keyframes as images of camera 0 named by their stamps (`<t_ns>.png`), and the points they see.
+
+    In a map of several recordings two may have one stamp: the second is `<t_ns>_2.png`.
+    """
     keyframes, points = map.alive_keyframes, map.alive_points
     f, spec = map.features, map.rig.cameras[0]
     rows = np.flatnonzero(f.point >= 0)
     image = np.searchsorted(keyframes, f.keyframe[rows])
     seen = Sightings(image, np.searchsorted(points, f.point[rows]), f.px[rows].astype(np.float64))
-    images = [(f"{map.keyframes.t_ns[k]}.png", map.pose(int(k)) @ spec.T_body_cam) for k in keyframes]
+    times: Counter[int] = Counter()
+    images = []
+    for k in keyframes.tolist():
+        t_ns = int(map.keyframes.t_ns[k])
+        times[t_ns] += 1
+        again = f"_{times[t_ns]}" if times[t_ns] > 1 else ""
+        images.append((f"{t_ns}{again}.png", map.pose(k) @ spec.T_body_cam))
     write_colmap(folder, spec.camera, images, map.points.xyz[points], seen)
     return {"images": len(images), "points": len(points), "observations": len(seen)}
 

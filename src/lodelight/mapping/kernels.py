@@ -72,23 +72,34 @@ def join(
 ) -> None:  # fmt: skip
     """Each feature row sees a point: one that saw none is linked; of two points, the one seen less becomes the other.
 
-    A point that was replaced on the way is followed.
+    A point that was replaced on the way is followed; a dead one, and one that the keyframe sees elsewhere, is left.
     """
     for i in range(len(rows)):
         row, new = rows[i], points[i]
         while replaced_by[new] >= 0:
             new = replaced_by[new]
+        if not alive[new] or _sees(keyframe[row], new, next_row, keyframe, head):
+            continue
         old = point[row]
         if old < 0:
-            if alive[new]:
-                point[row] = new
-                next_row[row] = head[new]
-                head[new] = row
-                n_obs[new] += 1
-        elif old != new:
+            point[row] = new
+            next_row[row] = head[new]
+            head[new] = row
+            n_obs[new] += 1
+        else:
             if n_obs[old] > n_obs[new]:
                 old, new = new, old
             fuse(old, new, point, next_row, keyframe, head, n_obs, n_visible, n_found, replaced_by, alive)
+
+
+@kernel
+def _sees(k: int, m: int, next_row: Ints, keyframe: Ints, head: Ints) -> bool:
+    at = head[m]
+    while at >= 0:
+        if keyframe[at] == k:
+            return True
+        at = next_row[at]
+    return False
 
 
 @kernel

@@ -149,16 +149,7 @@ def fuse_doubles(map: Map, here: Ints, there: Ints, orb: OrbConfig) -> None:
 def unite(map: Map, loop: Pair) -> None:
     """The verified matches of either direction become observations of one point."""
     for keyframe, located in ((loop.a, loop.there), (loop.b, loop.back)):
-        rows = map.feature_range(keyframe).start + located.feature
-        for row, point in zip(rows.tolist(), located.point.tolist(), strict=True):
-            own = int(map.features.point[row])
-            survivor = int(map.surviving(np.array([point], np.int32))[0])
-            if survivor < 0 or survivor in map.points_of(keyframe):
-                continue
-            if own < 0:
-                map.link(np.array([row]), np.array([survivor]))
-            else:
-                map.fuse_points(own, survivor)
+        map.join(map.feature_range(keyframe).start + located.feature, located.point)
 
 
 def take_along(map: Map, R_before: Array, p_before: Array) -> None:

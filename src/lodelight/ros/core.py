@@ -22,7 +22,6 @@ from lodelight.errors import ConfigError, LodelightError
 from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.io.anchors_toml import read_anchors
 from lodelight.localizer import Localizer, LocalizerConfig
-from lodelight.mapping.compact import compacted
 from lodelight.mapping.map import Map
 from lodelight.mapping.store import load_map, save_map
 from lodelight.messages import Estimate, Frame, Imu, LightFix, Message
@@ -278,11 +277,7 @@ class NodeCore:
     def _save(self) -> str:
         if not self.config.map_file:
             raise ConfigError("map_file is not given; set that parameter to where the map shall go")
-        map = self.system.map
-        if isinstance(self.system, Slam) and self.system.tags.T_world_map is not None:
-            with map.lock:  # the one at work stays where it is
-                map = compacted(map)
-            map.move(self.system.tags.T_world_map)
+        map = self.system.map_in_world() if isinstance(self.system, Slam) else self.system.map
         save_map(map, self.config.map_file)
         return f"{len(self.system.map.alive_keyframes)} keyframes saved to {self.config.map_file}"
 
