@@ -1,4 +1,4 @@
-"""A warehouse, 32 by 22 m and 7 m high: four pallet racks, three aisles, a packing area."""
+"""A warehouse, 32 by 22 m and 7 m high: four pallet racks, three aisles with signs over them, packing areas."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ def build(b: Builder) -> None:
     _beams(b)
     _markings(b)
     _signs_and_tags(b)
+    _aisle_signs(b)
     for x in np.arange(2.6, LENGTH - 2.0, 3.35):
         for y in (2.2, 6.4, 11.2, 16.0, 20.0):
             b.coded(x, y, 6.4, b.next_frequency(), radius_m=0.2, lumen=11000.0)
@@ -91,3 +92,18 @@ def _signs_and_tags(b: Builder) -> None:
         rng = b.random(f"poster {i}", int(b.changed))
         b.decal(x, y, 2.6, yaw, (1.0, 1.6), prints.poster(rng))
         b.tag("qr", 40 + i, x, y + 0.95, 1.9, yaw, 0.3, surveyed=True)
+
+
+def _aisle_signs(b: Builder) -> None:
+    """Boards that hang from every other beam over the aisles, with a tag on either side to be read from afar."""
+    number = 60
+    for j, y in enumerate((6.4, 11.2, 16.0)):
+        for x in (7.75, 15.75, 23.75):
+            b.mesh.box((x, y, 2.6), (0.04, 1.1, 0.5), "laminate")
+            for side in (-0.45, 0.45):
+                b.mesh.box((x, y + side, 4.72), (0.02, 0.02, 3.74), "metal")
+            for face, yaw in ((x - 0.02, 180), (x + 0.02, 0)):
+                left = 0.26 if yaw == 180 else -0.26
+                b.decal(face, y + left, 2.6, yaw, (0.4, 0.4), prints.marking("ABC"[j]))
+                b.tag("tag36h11", number, face, y - left, 2.6, yaw, 0.3)
+                number += 1
