@@ -7,7 +7,7 @@ right.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,7 @@ from lodelight.mapping.map import Map
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu, TagSighting
 from lodelight.odometry.flown import Flown
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
+from lodelight.tags.gate import KnownTag
 from lodelight.types import Array, Bools, Ints
 
 EventSink = Callable[..., None]
@@ -112,6 +113,16 @@ class InertialFront:
         step = self.odometry.flush()
         return None if step is None else self._located(step, clock)
 
+    def tie(self, known: Mapping[str, KnownTag], again: bool = False) -> None:
+        """See `InertialOdometry.tie`; the tags are given in the map's frame."""
+        if self.odometry.tie(known, again):
+            self._tied()
+
+    def _tied(self) -> None:
+        """The odometry's frame is the map's, as surveyed tags have it."""
+        if self._reference >= 0:
+            self._T_map_reference = self.map.pose(self._reference)
+
     @property
     def T_world_map(self) -> SE3:
         """Where the smooth frame lies in the corrected one, as the map stands now."""
@@ -134,6 +145,8 @@ class InertialFront:
             new = NewKeyframe(step, self.odometry.window.landmarks())
         with self.map.lock:
             self._settle_departed()
+            if step.tied:
+                self._tied()
             if self._reference < 0 and self._known and step.keyframe:
                 self._find(step, self.front_end.process(step.frame))
             if self._reference < 0 and (self._known or self.localization_only or new is None):

@@ -39,6 +39,7 @@ from lodelight.mapping.worker import InlineMapping, ThreadedMapping
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message, TagSighting
 from lodelight.odometry.inertial import InertialOdometry, OdometryConfig
 from lodelight.rig import Rig
+from lodelight.tags.gate import KnownTag
 from lodelight.trajectory import Trajectory
 from lodelight.types import Array
 
@@ -127,6 +128,7 @@ class Slam:
         work: Callable[[MappingJob], None] = self._map
         self.mapping = ThreadedMapping(work) if live else InlineMapping(work)
         self.mapping_ms: list[float] = []
+        self._tie: tuple[dict[str, KnownTag], bool] | None = None  # surveyed tags, and whether they move the window
         self.relocalizations = 0
         self.dropped = 0
         self._last_keyframe_ns = -FOREVER_NS
@@ -181,6 +183,9 @@ class Slam:
             if self.lights and isinstance(message, Frame):
                 with self.map.lock:
                     self._move_map()
+            if self._tie is not None:  # found where maps are made, and the window is not to be moved from there
+                tie, self._tie = self._tie, None
+                self.inertial.tie(*tie)
             located = self.inertial.feed(message)
             return None if located is None else self._take(located)
         return self.step(message) if isinstance(message, Frame) else None
@@ -277,7 +282,8 @@ class Slam:
         self.machine = LocalizationMachine(self.tracker, find)
         self.mapper = LocalMapper(map, orb, config.mapping)
         self.loops = LoopCloser(map, orb, places, config.loops, self.emit)
-        self.tags = MapTags(map, orb, config.mapping.sigma_px, self.anchors.tags, config.tags, self.emit)
+        upright = config.sensors.endswith("-inertial")
+        self.tags = MapTags(map, orb, config.mapping.sigma_px, self.anchors.tags, config.tags, self.emit, upright)
         self.path: list[PathNode] = []
         return find
 
@@ -389,7 +395,11 @@ class Slam:
         before = None if alone else (node.reference, node.T_reference_body)
         self.path[flown.at] = PathNode(node.t_ns, keyframe, SE3.identity(), before)
         with self.map.lock:
-            self.tags.note(located.tags, keyframe, SE3.identity(), located.estimate.covariance, own=True)
+            elsewhere = self.tags.note(
+                located.tags, keyframe, SE3.identity(), located.estimate.covariance, own=True
+            )  # fmt: skip
+            if located.tags and self.tags.aligned:
+                self._tie = self.tags.surveys(), elsewhere
         return keyframe
 
     def _map(self, job: MappingJob) -> None:

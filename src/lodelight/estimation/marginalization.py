@@ -90,6 +90,15 @@ class Prior:
                 B[span.start : span.start + 3, span.start : span.start + 3] = R_new_old
         return Prior(self.keys, B @ self.H @ B.T, B @ self.g)
 
+    def carried(self, R_new_old: Array, lin: Mapping[Key, Array], moved: Array) -> Prior:
+        """About unknowns that were turned about z and moved together, to lin; the belief itself stays where it is.
+
+        moved (4,) : yaw and position by which they were, as the columns of the null space have it. What is known of the
+        unknowns among each other goes along exactly, which a quadratic about the old place says to first order only.
+        """
+        turned = self.turned(R_new_old)
+        return Prior(self.keys, turned.H, turned.g + turned.H @ (turned.null_space(lin) @ moved))
+
     def released(self, lin: Mapping[Key, Array]) -> Prior:
         """Without what it knows of absolute yaw and position: as if the frame it is given in were unknown."""
         N = self.null_space(lin)

@@ -17,7 +17,7 @@ import numpy as np
 from lodelight.errors import CalibrationError
 from lodelight.estimation.marginalization import Key, Prior
 from lodelight.estimation.window_build import build, store
-from lodelight.estimation.window_frames import Seen, SeenTag, WindowFrame, pose_of, pose_row, row_of
+from lodelight.estimation.window_frames import Seen, SeenTag, WindowFrame, moved_row, pose_of, pose_row, row_of
 from lodelight.estimation.window_leave import forget_tags, marginalize_oldest
 from lodelight.estimation.window_problem import CONVERGED_CHI2, SETTLED_CHI2, Belief, Problem
 from lodelight.estimation.window_tags import TagStates
@@ -31,7 +31,7 @@ from lodelight.estimation.window_types import (
     TagView,
     WindowConfig,
 )
-from lodelight.geometry.se3 import SE3
+from lodelight.geometry.se3 import SE3, level
 from lodelight.imu.preintegration import NavState, preintegrate
 from lodelight.imu.samples import ImuSamples
 from lodelight.rig import ImuSpec, Rig
@@ -40,6 +40,8 @@ from lodelight.types import AnyArray, Array
 __all__ = [
     "Departed", "Landmarks", "Observations", "Solution", "StartSigma", "Tag", "TagView", "Window", "WindowConfig",
 ]  # fmt: skip
+
+CARRY_RAD = 2e-4  # of yaw between the window and what its prior is linearized about; the square of it is nothing
 
 
 class Window:
@@ -182,7 +184,7 @@ class Window:
         enough = SETTLED_CHI2 if newest.keyframe else CONVERGED_CHI2
         taken = problem.minimize(most, enough)
         if taken >= 0 and doubtful:
-            self.tag_states.test(problem, doubtful, self.config.tag_gate_chi2)
+            self.tag_states.test(problem, doubtful, self.config)
             if any(s.use for s in doubtful):
                 store(self, problem, rows)
                 problem, rows = build(self)
@@ -193,6 +195,7 @@ class Window:
         good = self._retested(problem) if newest.keyframe else True
         rejected = store(self, problem, rows)
         self._problem, self._covariance = problem, None
+        self._carry_prior()
         seen_now = problem.sightings.frame == len(self.frames) - 1
         track = np.repeat(problem.sightings.track, np.diff(problem.sightings.start))
         solution = Solution(
@@ -294,12 +297,7 @@ class Window:
             raise ValueError("the window may only be turned about the vertical: gravity is known")
 
         def moved(row: Array) -> Array:
-            out: Array = row.copy()
-            out[:9] = (R @ row[:9].reshape(3, 3)).ravel()
-            out[9:12] = R @ row[9:12] + t
-            if len(row) > 12:
-                out[12:15] = R @ row[12:15]
-            return out
+            return moved_row(row, R, t)
 
         for frame in self.frames:
             frame.x = moved(frame.x)
@@ -316,6 +314,28 @@ class Window:
             self._release_gauge()
         self._problem = self._covariance = None
 
+    def _carry_prior(self) -> None:
+        """Turn what the prior is linearized about along with the window.
+
+        Where yaw is hardly known it moves by degrees, and a prior about the old one would take the second order of that
+        turn for a measurement of yaw.
+        """
+        held = [(f, f.lin) for f in self.frames if f.lin is not None]
+        if not held:
+            return
+        now, lin = held[-1][0].x, held[-1][1]
+        T = level(pose_of(now) @ pose_of(lin).inverse(), lin[9:12])
+        yaw = float(np.arctan2(T.R[1, 0], T.R[0, 0]))
+        if abs(yaw) < CARRY_RAD:
+            return
+        for frame, row in held:
+            frame.lin = moved_row(row, T.R, T.t)
+        for state in self.tag_states.states:
+            state.lin = None if state.lin is None else moved_row(state.lin, T.R, T.t)
+        step = now[9:12] - lin[9:12] - yaw * np.array([-now[10], now[9], 0.0])
+        self.prior = self.prior.carried(T.R, self.lin_rows(), np.array([yaw, *step]))
+        self._problem = None
+
     def lin_rows(self) -> dict[Key, Array]:
         """Where the prior's unknowns are linearized."""
         rows: dict[Key, Array] = {("pose", f.key): f.lin for f in self.frames if f.lin is not None}
@@ -323,12 +343,11 @@ class Window:
         return rows
 
     def _release_gauge(self) -> None:
+        for key in [key for key in self.beliefs if key[0] == "frame"]:  # nothing has left yet, and no prior is there
+            belief = self.beliefs.pop(key)
+            next(frame for frame in self.frames if frame.key == key[1]).lin = belief.mean.copy()
+            self.prior = Prior([("pose", key[1]), ("rest", key[1])], belief.information, np.zeros(15))
         self.prior = self.prior.released(self.lin_rows())
-        for key, belief in list(self.beliefs.items()):
-            if key[0] == "frame":
-                one = Prior([("pose", key[1]), ("rest", key[1])], belief.information, np.zeros(15))
-                loose = one.released({("pose", key[1]): belief.mean})
-                self.beliefs[key] = Belief(belief.mean, loose.H)
 
     def _keep_landmarks(self, mask: AnyArray) -> None:
         for name in ("track", "world", "sigma", "seen", "inv_depth"):

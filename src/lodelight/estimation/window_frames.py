@@ -134,6 +134,16 @@ def pose_of(row: Array) -> SE3:
     return SE3(row[:9].reshape(3, 3).copy(), row[9:12].copy())
 
 
+def moved_row(row: Array, R: Array, t: Array) -> Array:
+    """A state or a pose in another frame: T_new_old = (R, t)."""
+    out: Array = row.copy()
+    out[:9] = (R @ row[:9].reshape(3, 3)).ravel()
+    out[9:12] = R @ row[9:12] + t
+    if len(row) > 12:
+        out[12:15] = R @ row[12:15]
+    return out
+
+
 def gathered(frames: Sequence[WindowFrame]) -> tuple[Sightings, Ints, Ints]:
     """All sightings sorted by landmark; for every row its frame and its row in that frame.
 

@@ -104,7 +104,8 @@ def _finished(window: Window, tracks: AnyArray) -> Landmarks:
 def forget_tags(window: Window) -> None:
     """Marginalize estimated tags that no frame of the window sees, beyond those it may remember.
 
-    What was known of one, its correlation with the window forgotten, is believed when it is seen again.
+    What was known of one, its correlation with the window forgotten, is believed when it is seen again; of a surveyed
+    one its survey is.
     """
     states = window.tag_states.states
     viewed = {window.tag_states.number[v.view.id] for f in window.frames for v in f.tags}
@@ -124,5 +125,5 @@ def forget_tags(window: Window) -> None:
             window.prior.g[span] += state.belief.information @ d[0]
         window.prior = window.prior.without([("tag", number)])
         state.lin = None
-        if covariance is not None:
+        if covariance is not None and not state.given:
             state.belief = Belief(state.row.copy(), inverse(window.config.tag_inflation * covariance))

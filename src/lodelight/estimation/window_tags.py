@@ -11,7 +11,7 @@ from lodelight.errors import ConfigError
 from lodelight.estimation.factors.tag_corners import tag_corner_jacobian, tag_corner_residual
 from lodelight.estimation.window_frames import SeenTag, pose_row
 from lodelight.estimation.window_problem import Belief, Problem
-from lodelight.estimation.window_types import Tag, TagView
+from lodelight.estimation.window_types import Tag, TagView, WindowConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.types import Array
 
@@ -20,6 +20,7 @@ from lodelight.types import Array
 class TagState:
     """row (12,) pose in the window's frame; exact : surveyed, not estimated; lin : where the prior holds it
 
+    given : what is believed of it was told, and is believed again whenever it comes back
     started : row means something; established : a sighting of it has counted, so that the next one can be tested
     """
 
@@ -27,6 +28,7 @@ class TagState:
     corners: Array
     row: Array
     exact: bool = False
+    given: bool = False
     started: bool = False
     established: bool = False
     belief: Belief | None = None
@@ -43,7 +45,7 @@ class TagStates:
         T = tag.T_world_tag
         state = TagState(tag.id, np.ascontiguousarray(tag.corners_tag, np.float64), pose_row(T or SE3.identity()))
         if T is not None:
-            state.started = True
+            state.started = state.given = True
             state.exact = tag.covariance is None
             if tag.covariance is not None:
                 state.belief = Belief(state.row.copy(), inverse(tag.covariance))
@@ -55,7 +57,7 @@ class TagStates:
         elif T is not None:  # its estimate is in the prior: believe the new pose as well
             sigma = np.array([1e-4] * 3 + [1e-4] * 3)
             information = np.diag(sigma**-2.0) if tag.covariance is None else inverse(tag.covariance)
-            self.states[at].belief = Belief(state.row, information)
+            self.states[at].belief, self.states[at].given = Belief(state.row, information), True
 
     def sighted(self, view: TagView, T_world_cam: SE3) -> None:
         """Raises ConfigError for a tag that was not declared, or of which nothing says where it is."""
@@ -73,14 +75,14 @@ class TagStates:
         state = self.states[self.number[id]]
         return state.exact or state.belief is not None or state.established
 
-    def test(self, problem: Problem, doubtful: Sequence[SeenTag], gate_chi2: float) -> None:
+    def test(self, problem: Problem, doubtful: Sequence[SeenTag], config: WindowConfig) -> None:
         """Judge sightings in the newest frame against a problem that was solved without them."""
         for seen in doubtful:
-            seen.chi2 = self._innovation(problem, seen.view)
+            seen.chi2 = self._innovation(problem, seen.view, config)
             seen.tested = True
-            seen.use = seen.view.trusted or seen.chi2 <= gate_chi2
+            seen.use = seen.view.trusted or seen.chi2 <= config.tag_gate_chi2
 
-    def _innovation(self, problem: Problem, view: TagView) -> float:
+    def _innovation(self, problem: Problem, view: TagView, config: WindowConfig) -> float:
         """Chi-square, of 8 degrees of freedom, of what the window expects of these corners; inf where it cannot see
         them. The uncertainties of the pose and of the tag count."""
         x, c = problem.state, view.camera
@@ -116,6 +118,8 @@ class TagStates:
         if P is None:
             return float("inf")
         S += unknown @ P @ unknown.T
+        off = J[:, :6] * np.repeat([config.tag_gate_rad, config.tag_gate_m], 3)
+        S += off @ off.T
         return float(r @ np.linalg.solve(S, r))
 
     def move(self, moved: Callable[[Array], Array], R: Array, all_of_them: bool) -> None:

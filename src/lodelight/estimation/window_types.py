@@ -26,6 +26,8 @@ class WindowConfig:
         keyframes go into the prior, the later ones go on as a new landmark: no sighting counts twice
     sure_depth : relative sigma of the inverse depth above which a landmark that leaves is dropped
     tag_gate_chi2 : of the eight residuals of a tag against the window without it; 99 % of a chi-square distribution
+    tag_gate_rad, tag_gate_m : sigmas by which the window's pose may be off beyond its covariance in that test, which
+        knows of no lens and no IMU that does not quite fit: half a per cent of the 10 m to the next tag
     tag_memory : estimated tags that stay in the window after their last sighting has left it
     tag_inflation : on the covariance of one that leaves, whose correlation with the window is forgotten
     imu_noise_scale : on the rig's noise densities, which are those of a sensor at rest
@@ -44,6 +46,8 @@ class WindowConfig:
     split: int = 5
     sure_depth: float = 0.5
     tag_gate_chi2: float = 20.09
+    tag_gate_rad: float = 0.01
+    tag_gate_m: float = 0.05
     tag_memory: int = 8
     tag_inflation: float = 4.0
     imu_noise_scale: float = 1.0

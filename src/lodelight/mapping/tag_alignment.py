@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lodelight.geometry.se3 import SE3, carried_covariance
+from lodelight.geometry.se3 import SE3, carried_covariance, level
 from lodelight.types import Array
 
 AGREE_M = 0.3  # that a tag may be off its survey, as an alignment by another one has it
@@ -26,15 +26,17 @@ class Consensus:
 
 
 def consensus(
-    T_map_tag: Mapping[int, SE3], T_world_tag: Mapping[int, SE3], spread: Mapping[int, float]
+    T_map_tag: Mapping[int, SE3], T_world_tag: Mapping[int, SE3], spread: Mapping[int, float], upright: bool = False
 ) -> Consensus | None:
     """The alignment by the tag with which most others agree, and of several by that of least spread; None without tags.
 
     T_map_tag : of each mapped tag; T_world_tag : its survey; spread : variance of its place, m^2
+    upright : both frames have z up, and only a turn about it lies between them
     """
     best: Consensus | None = None
     for i, T in T_map_tag.items():
         T_world_map = T_world_tag[i] @ T.inverse()
+        T_world_map = level(T_world_map, T.t) if upright else T_world_map
         agreeing = [j for j, other in T_map_tag.items() if off_m(T_world_map @ other, T_world_tag[j]) < AGREE_M]
         if best is None or (len(agreeing), -spread[i]) > (len(best.agreeing), -spread[best.by]):
             best = Consensus(T_world_map, i, agreeing)

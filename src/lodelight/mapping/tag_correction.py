@@ -23,12 +23,15 @@ def correct_by_tags(
 ) -> float:
     """A pose graph of keyframes and tags, then adjustment of everything; returns how far a keyframe moved at most, m.
 
+    iterations : of the adjustment; 0 where the IMU will do it later
     Surveyed tags stay where they are; where there is none, the root does.
     """
     with map.lock:
         moved_m = _spread_error(map, sigma_px / map.rig.cameras[0].camera.focal_px)
         before = map.keyframes.R.copy(), map.keyframes.p.copy()
         everything = map.alive_keyframes
+    if not iterations:
+        return moved_m
     adjust(map, everything, orb, sigma_px, iterations, stop)
     with map.lock:
         take_along(map, *before)

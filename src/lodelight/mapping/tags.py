@@ -52,6 +52,9 @@ class MapTagsConfig:
     survey: SurveyConfig = field(default_factory=SurveyConfig)
 
 
+TELLING_VIEWS = 6  # of a tag that do not agree, before it is named: of three one may well be poor
+
+
 class MapTags:
     """The tags of one map. `see` runs with tracking, `note` when a frame has been located, `process` with mapping.
 
@@ -61,8 +64,10 @@ class MapTags:
 
     def __init__(
         self, map: Map, orb: OrbConfig, sigma_px: float, tags: Iterable[Tag] = (), config: MapTagsConfig | None = None,
-        on_event: EventSink | None = None,
+        on_event: EventSink | None = None, upright: bool = False,
     ) -> None:  # fmt: skip
+        """upright : the map has z up, by an IMU, which has a say in the map's last adjustment"""
+        self.upright = upright
         self.map, self.orb, self.sigma_px = map, orb, sigma_px
         self.config = config or MapTagsConfig()
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
@@ -93,18 +98,20 @@ class MapTags:
 
     def note(
         self, sightings: Sequence[TagSighting], reference: int, T_reference_body: SE3, covariance: Array, own: bool
-    ) -> None:
+    ) -> bool:
         """Judge the sightings of a located frame, and keep the views that say something new.
 
+        Returns whether surveyed tags agree that the frame is elsewhere.
         own : the frame is the keyframe `reference` itself; covariance (6, 6) of its pose, before tags had a say
         """
         if not sightings:
-            return
+            return False
         T_map_body = self.map.pose(reference) @ T_reference_body
         for s in sightings:
             if (s.family, s.id) not in self.gate.tags:
                 self._expect(s)
-        for verdict in self.gate.judge(sightings, self.spec, T_map_body, covariance):
+        verdicts = self.gate.judge(sightings, self.spec, T_map_body, covariance)
+        for verdict in verdicts:
             tag = find_tag(self.map, verdict.sighting.name)
             disputed = verdict.kind == "contradicts" and self._disputable(tag)
             if (verdict.usable or verdict.kind == "new" or disputed) and (own or self._apart(tag, T_map_body)):
@@ -114,6 +121,7 @@ class MapTags:
         if self.T_world_map is None and self._fresh:  # not before the next keyframe, but now
             self._map_fresh(sightings[0].t_ns)
             self._align(sightings[0].t_ns)
+        return any(v.kind == "corrects" and v.tag is not None and v.tag.surveyed for v in verdicts)
 
     # -- with mapping -------------------------------------------------------------------------------------------
 
@@ -174,6 +182,18 @@ class MapTags:
         turned = np.eye(6)
         turned[3:, 3:] = self.T_world_map.R
         out: Array = turned @ covariance @ turned.T
+        return out
+
+    def surveys(self) -> dict[str, KnownTag]:
+        """Surveyed tags by name that are not known to be wrong, where they hang in the map's frame; none before it is
+        aligned."""
+        if self.T_world_map is None:
+            return {}
+        T_map_world, out = self.T_world_map.inverse(), {}
+        for (family, id), known in self.book.tags.items():
+            name = f"{family} {id}"
+            if known.T_world_tag is not None and name not in self._distrusted and name not in self.gate.named:
+                out[name] = replace(known, T_world_tag=T_map_world @ known.T_world_tag)
         return out
 
     def found(self) -> list[Tag]:
@@ -237,7 +257,7 @@ class MapTags:
             found = self._by_views(tag)
             if isinstance(found, MappedTag):
                 self._place(tag, found.T_world_tag, found.covariance)
-            elif "agree" in found.why:
+            elif "agree" in found.why and np.sum(self.map.tag_views.tag == tag) >= TELLING_VIEWS:
                 self._tell(t_ns, tag_name(self.map, tag), "contradicts", found.why)
         self._fresh.clear()
 
@@ -267,7 +287,7 @@ class MapTags:
         known = [i for i in range(len(self.map.tags)) if self._surveyed(i) is not None]
         found = {i: T for i in known if (T := self._mapped(i)) is not None}
         spread = {i: float(np.trace(self.map.tags.covariance[i][3:, 3:])) for i in found}
-        best = consensus(found, {i: self._survey_of(i) for i in found}, spread)
+        best = consensus(found, {i: self._survey_of(i) for i in found}, spread, self.upright)
         if best is None:
             return
         if len(best.agreeing) < 2 and (len(found) > 1 or self.T_world_map is not None):
@@ -339,7 +359,8 @@ class MapTags:
     # -- corrections --------------------------------------------------------------------------------------------
 
     def _correct(self, t_ns: int, worst_px: float, stop: Callable[[], bool] | None) -> None:
-        moved_m = correct_by_tags(self.map, self.orb, self.sigma_px, self.config.iterations, stop)
+        iterations = 0 if self.upright else self.config.iterations  # the last adjustment has the IMU, this one has not
+        moved_m = correct_by_tags(self.map, self.orb, self.sigma_px, iterations, stop)
         with self.map.lock:
             seen = np.unique(self.map.tag_views.tag[self.map.tag_views.usable])
             self._alignment = [tag_name(self.map, int(i)) for i in seen if self.map.tags.surveyed[i]] or self._alignment

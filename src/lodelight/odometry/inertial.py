@@ -7,7 +7,7 @@ a new one begins, and goes on where the old one was left.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,8 +22,10 @@ from lodelight.imu.stream import ImuStream
 from lodelight.imu.vibration import Vibration
 from lodelight.messages import Frame, Imu, Status, TagSighting
 from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
-from lodelight.odometry.tag_views import tag_views
+from lodelight.odometry.surveyed import SurveyedTags
+from lodelight.odometry.tag_views import NewTags, tag_views
 from lodelight.rig import Rig
+from lodelight.tags.gate import KnownTag
 from lodelight.types import Array
 
 EventSink = Callable[..., None]
@@ -64,6 +66,7 @@ class OdometryStep:
     """One frame. state : T_map_body, velocity and biases; covariance (15, 15) of it
     keyframe : the reason why it is one, empty where it is none; why : of a status that is not plain tracking
     restarted : this frame is the first of a new window; tags : that were seen in it
+    tied : surveyed tags had a say in it: it lies where they put it
     """
 
     frame: Frame
@@ -76,6 +79,7 @@ class OdometryStep:
     why: str = ""
     restarted: bool = False
     tags: tuple[TagSighting, ...] = ()
+    tied: bool = False
 
 
 class InertialOdometry:
@@ -103,6 +107,8 @@ class InertialOdometry:
         self.restarts = 0
         self._pending: tuple[Frame, Sequence[TagSighting]] | None = None
         self._contradicted: dict[str, int] = {}  # frames in a row in which a tag did
+        self._surveyed = SurveyedTags()
+        self._new_tags = NewTags(rig.cameras[0].camera)
         self._last_ns: int | None = None
         self._keyframe: LastKeyframe | None = None
         self._blind_since: int | None = None
@@ -134,6 +140,15 @@ class InertialOdometry:
         (frame, tags), self._pending = self._pending, None
         return replace(self._step(frame, tags), tags=tuple(tags))
 
+    def tie(self, known: Mapping[str, KnownTag], again: bool = False) -> bool:
+        """Surveyed tags by name, where they hang in the map's frame; whether the window was laid down among them.
+
+        again : they agree that it lies elsewhere than it believes, and may move it as far as they like
+        """
+        self._surveyed.learn(known, self.window)
+        self._surveyed.tied &= not again
+        return self._lay_down() is not None
+
     # -- one frame ----------------------------------------------------------------------------------------------
 
     def _step(self, frame: Frame, tags: Sequence[TagSighting]) -> OdometryStep:
@@ -145,9 +160,12 @@ class InertialOdometry:
             return self._fail(frame, missing)
         window = self.window
         predicted = window.predict(frame.t_ns, imu)
+        moved = self._lay_down(tags, predicted.T_world_body)
+        predicted = predicted if moved is None else _moved(predicted, moved)
         R_now_last = self.R_body_cam.T @ predicted.T_world_body.R.T @ window.newest.T_world_body.R @ self.R_body_cam
         tracks = self.tracker.process(frame, R_now_last, sigma_rotation=2e-3)
-        views, new = tag_views(window, tags, self.rig.cameras[0], predicted.T_world_body)
+        T_map_cam = predicted.T_world_body @ self.rig.cameras[0].T_body_cam
+        views, new = tag_views(window, tags, T_map_cam, self._surveyed.declaration, self._new_tags.place)
         reason = self._keyframe_reason(tracks, predicted.T_world_body)
         reason = reason or (f"first sight of {new[0]}" if new else "")
         window.add_frame(frame.t_ns, imu, self._observations(tracks), views, bool(reason), self._still(imu))
@@ -164,9 +182,26 @@ class InertialOdometry:
         blind = self._blind_since is not None
         why = f"{inliers} tracks agree, fewer than {self.config.few_tracks}: the IMU carries the pose" if blind else ""
         self.stream.forget_before(frame.t_ns)
+        used = {view.id for view in views} - set(solution.tag_rejected)
         return OdometryStep(
-            frame, "degraded" if blind else "tracking", state, window.covariance(), tracks, inliers, reason, why
-        )
+            frame, "degraded" if blind else "tracking", state, window.covariance(), tracks, inliers, reason, why,
+            tied=self._surveyed.tied and not used.isdisjoint(self._surveyed.known),
+        )  # fmt: skip
+
+    def _lay_down(self, tags: Sequence[TagSighting] = (), T_map_body: SE3 | None = None) -> SE3 | None:
+        """Move the window among the surveyed tags, if it does not lie there yet and one is known, or is in sight from
+        about T_map_body."""
+        if self.window is None:
+            return None
+        T_map_cam = None if T_map_body is None else T_map_body @ self.rig.cameras[0].T_body_cam
+        moved = self._surveyed.lay_down(
+            self.window, tags, lambda s: None if T_map_cam is None else self._new_tags.place(s, T_map_cam)
+        )  # fmt: skip
+        if moved is not None:
+            self._new_tags.move(moved)
+            if self._keyframe is not None:
+                self._keyframe = replace(self._keyframe, T_map_body=moved @ self._keyframe.T_map_body)
+        return moved
 
     def _name_wrong_tags(self, t_ns: int, solution: Solution) -> None:
         """Tags that the window left out twice in a row; one that hangs right may miss the test once in a hundred."""
@@ -265,7 +300,8 @@ class InertialOdometry:
         if failure:
             return f"a start was found ({start.why}), but {failure}"
         self.emit(window.newest.t_ns, "start", how=start.how, why=start.why)
-        self.window, self._blind_since = window, None
+        self.window, self._blind_since, self._surveyed.tied = window, None, False
+        self._new_tags.seen.clear()
         self.starter.reset()
         self._views = []
         return window
