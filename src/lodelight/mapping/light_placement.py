@@ -91,14 +91,18 @@ class Placement:
         return Move(T_world_map, f"the rays to {', '.join(laid.lights)} meet where they hang", len(laid.lights))
 
     def settle(self, without: Mapping[str, object]) -> Move | None:
-        """By all lights that were passed, but for those; where poses by them alone were tipped, this is not."""
+        """By all lights that were passed, but for those; where poses by them alone were tipped, this is not.
+
+        None for a map that an IMU levelled: its adjustment has had the lights, and only their tilt is left.
+        """
+        if self._upright:
+            return None
         lights = {name: light for name, light in self._lights.items() if name not in without}
         tracks = self._rays.tracks()
         laid = settle(SE3.identity(), tracks, lights, *self._rays.up()) if self.aligned and tracks else None
         if laid is None:
             return None
-        T_world_map = self._level(laid.T_world_map, self._met[-1][2] if self._met else None)
-        return Move(T_world_map, f"by the rays to {len(laid.lights)} lights", len(tracks))
+        return Move(laid.T_world_map, f"by the rays to {len(laid.lights)} lights", len(tracks))
 
     def _review(self) -> Move | None:
         """Align with what most pairs say: once for good, and again only where they contradict what was believed."""
