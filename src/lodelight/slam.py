@@ -219,14 +219,9 @@ class Slam:
                     covariance = self._covariance(tracked)
                     self.tags.note(tags, tracked.reference, tracked.T_reference_body, covariance, own=False)
         elif self.first_views is not None and self._hopeless(frame.t_ns):
-            self.emit(
-                frame.t_ns,
-                "begun_anew",
-                why="lost for longer than the map had been followed",
-                keyframes=len(self.map.keyframes),
-            )
+            self.emit(frame.t_ns, "begun_anew", why="lost for longer than the map had been followed")
             self._assemble(Map(self.map.rig))
-            self.first_views = self._first_views()
+            self.first_views, self.metric = self._first_views(), False
         return estimate
 
     def trajectory(self) -> Trajectory:
