@@ -132,7 +132,6 @@ def test_mistakes_get_one_line_and_exit_status_2(capsys, short_run, tmp_path):
     assert "no-such" in fails(capsys, tmp_path / "no-such", "--out", tmp_path / "o")
     assert "stereo" in fails(capsys, source, "--out", tmp_path / "o", "--sensors", "stereo")
     assert "lidar" in fails(capsys, source, "--out", tmp_path / "o", "--sensors", "lidar")
-    assert "mono" in fails(capsys, source, "--out", tmp_path / "o", "--sensors", "mono")
     assert "orb.x" in fails(capsys, source, "--out", tmp_path / "o", "--set", "orb.x=1")
     (tmp_path / "file").write_text("")
     assert "file" in fails(capsys, source, "--out", tmp_path / "file" / "o")
