@@ -17,12 +17,12 @@ LENSES = {
 TWIST = np.array([1.5, -2.0, 1.0, 0.4, -0.2, 0.3])  # rad/s, m/s: a hand that shakes
 
 
-def shutter(model="radtan", row_time_s=ROW_TIME_S):
+def shutter(model="radtan", row_time_s=ROW_TIME_S, stamped_row=0.0):
     camera = Camera.create(model, 640, 480, *LENSES[model])
-    return Shutter(CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s))
+    return Shutter(CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s, stamped_row=stamped_row))
 
 
-def rolled(camera, xyz, twist, row_time_s=ROW_TIME_S):
+def rolled(camera, xyz, twist, row_time_s=ROW_TIME_S, stamped_row=0.0):
     """(N, 2) px where a rolling shutter sees points (N, 3) of the camera's frame at the stamp.
 
     The pixel is seen when its own row is read: iterated point by point, with exact motions.
@@ -30,7 +30,7 @@ def rolled(camera, xyz, twist, row_time_s=ROW_TIME_S):
     px, _ = camera.project(xyz)
     for _ in range(8):
         for i in range(len(xyz)):
-            dt_s = px[i, 1] * row_time_s
+            dt_s = (px[i, 1] - stamped_row) * row_time_s
             # the camera's pose after dt, in its frame at the stamp
             moved = SE3(SE3.exp(np.append(dt_s * twist[:3], np.zeros(3))).R, dt_s * twist[3:])
             px[i] = camera.project(moved.inverse() @ xyz[i : i + 1])[0][0]
@@ -52,10 +52,11 @@ def seen_as(camera, px, inv_depth):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("stamped_row", [0.0, 480.0])
 @pytest.mark.parametrize("model", sorted(LENSES))
-def test_rows_read_late_are_put_where_the_first_would_have_seen_them(model):
-    rolling, xyz = shutter(model), points(np.random.default_rng(0))
-    late = rolled(rolling.camera, xyz, TWIST)
+def test_rows_read_early_or_late_are_put_where_the_stamped_one_would_have_seen_them(model, stamped_row):
+    rolling, xyz = shutter(model, stamped_row=stamped_row), points(np.random.default_rng(0))
+    late = rolled(rolling.camera, xyz, TWIST, stamped_row=stamped_row)
     expected, _ = rolling.camera.project(xyz)
     assert np.linalg.norm(late - expected, axis=1).max() > 5.0
     straight = rolling.straightened(seen_as(rolling.camera, late, 1.0 / xyz[:, 2]), TWIST)

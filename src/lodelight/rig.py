@@ -13,7 +13,8 @@ from lodelight.geometry.se3 import SE3
 
 # Of the colour camera of a Kinect, whose shutter rolls. The turns that rows of one image show against one another are
 # those that its neighbours' poses say at 53 us in freiburg1_rpy (2 us standard deviation) and 58 us in the red kitchen
-# (4 us), without any truth; pairs straightened by the turns of motion capture fit one pose best between 42 and 54 us.
+# (4 us), without any truth but with poses that assumed 50 us: with 25 us they say 37. Pairs straightened by the turns
+# of motion capture fit one pose best between 42 and 54 us.
 KINECT_ROW_TIME_S = 50e-6
 
 
@@ -21,7 +22,8 @@ KINECT_ROW_TIME_S = 50e-6
 class CameraSpec:
     """A camera on the body. `row_time_s` is 0 for a global shutter; `time_offset_s` is added to its stamps.
 
-    Row 0 is exposed at the stamp, row v `v row_time_s` later.
+    Row `stamped_row` is exposed at the stamp, row v `(v - stamped_row) row_time_s` later: 0 where a driver stamps the
+    first row, the image's height where it stamps what has arrived.
     """
 
     name: str
@@ -30,6 +32,7 @@ class CameraSpec:
     rate_hz: float = 0.0
     time_offset_s: float = 0.0
     row_time_s: float = 0.0
+    stamped_row: float = 0.0
     exposure_s: float = 0.0
 
 

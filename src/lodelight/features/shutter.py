@@ -1,8 +1,8 @@
 """A rolling shutter reads row after row while the camera moves: corners, put where a global shutter would see them.
 
-A corner of row v is seen `v row_time_s` after the stamp. With the camera's turn w and velocity u over the readout, a
-point of the camera frame at that time, X, was at Exp(w dt) X + u dt when the stamp was taken. At 1 rad/s and 30 ms a
-frame's last row is 15 px away from where its first would have seen it.
+A corner of row v is seen dt = `(v - stamped_row) row_time_s` after the stamp. With the camera's turn w and velocity u
+over the readout, a point of the camera frame at that time, X, was at Exp(w dt) X + u dt when the stamp was taken. At
+1 rad/s and 30 ms a frame's last row is 15 px away from where its first would have seen it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lodelight.rig import CameraSpec
 from lodelight.types import AnyArray, Array
 
 STILL = np.zeros(6)
-BEYOND = 0.1  # of the image's width: so far outside of it a straightened corner may lie, as the first row never saw it
+BEYOND = 0.1  # of the image's width: so far outside of it a straightened corner may lie: the stamped row never saw it
 UNMEASURED = 1e-6  # information that keeps the system solvable where corners leave a direction open
 
 
@@ -27,7 +27,7 @@ class Shutter:
 
     def __init__(self, spec: CameraSpec) -> None:
         self.camera = spec.camera
-        self.row_time_s = spec.row_time_s
+        self.row_time_s, self.stamped_row = spec.row_time_s, spec.stamped_row
 
     @property
     def rolls(self) -> bool:
@@ -66,7 +66,7 @@ class Shutter:
         Linear in the turn, and in the pose, which is free beside it: a turn moves later rows farther.
         """
         H, g = _turn_system(
-            self.camera.model, self.camera.params, self.row_time_s, np.asarray(px, np.float64), sigma_px, xyz_cam
+            self.camera.model, self.camera.params, self._delay_s(px), np.asarray(px, np.float64), sigma_px, xyz_cam
         )
         H += UNMEASURED * np.eye(9)
         information = np.linalg.inv(covariance)
@@ -76,11 +76,11 @@ class Shutter:
         return out
 
     def reach_px(self, twist: Array) -> float:
-        """How far a turn moves the last row, nearly."""
+        """How far a turn moves the last row from the first, nearly."""
         return float(np.linalg.norm(twist[:3])) * self.readout_s * self.camera.focal_px
 
     def _delay_s(self, px: AnyArray) -> Array:
-        return self.row_time_s * px[:, 1].astype(np.float64)
+        return self.row_time_s * (px[:, 1].astype(np.float64) - self.stamped_row)
 
 
 @kernel
@@ -101,7 +101,7 @@ def _turned(vectors: Array, by: Array) -> Array:
 
 @kernel
 def _turn_system(
-    model: int, params: Array, row_time_s: float, px: Array, sigma_px: Array, xyz_cam: Array
+    model: int, params: Array, delay_s: Array, px: Array, sigma_px: Array, xyz_cam: Array
 ) -> tuple[Array, Array]:
     """H (9, 9) and g (9,) of pixels by the turn per second, by a turn and by a shift of the points, camera frame."""
     H, g = np.zeros((9, 9)), np.zeros(9)
@@ -109,13 +109,13 @@ def _turn_system(
     for i in range(len(px)):
         x, y, z = xyz_cam[i]
         u, v, _ = project_jacobian(model, params, x, y, z, E)
-        w, delay_s = 1.0 / sigma_px[i], row_time_s * px[i, 1]
+        w = 1.0 / sigma_px[i]
         for k in range(2):
             e0, e1, e2 = w * E[k, 0], w * E[k, 1], w * E[k, 2]
             A[k, 3], A[k, 4], A[k, 5] = e2 * y - e1 * z, e0 * z - e2 * x, e1 * x - e0 * y  # of X + axis x X
             A[k, 6], A[k, 7], A[k, 8] = e0, e1, e2
             for j in range(3):
-                A[k, j] = delay_s * A[k, 3 + j]
+                A[k, j] = delay_s[i] * A[k, 3 + j]
         r0, r1 = w * (u - px[i, 0]), w * (v - px[i, 1])
         for a in range(9):
             g[a] += A[0, a] * r0 + A[1, a] * r1

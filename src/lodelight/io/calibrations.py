@@ -49,7 +49,7 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def euroc_camera(root: Section, name: str) -> CameraSpec:
-    """A camera's `sensor.yaml`; `time_offset_s`, `row_time_s` and `exposure_s` are this project's own additions."""
+    """A camera's `sensor.yaml`, with this project's additions: time_offset_s, row_time_s, stamped_row, exposure_s."""
     return CameraSpec(
         name,
         _named_lens(root, "distortion_coefficients"),
@@ -57,6 +57,7 @@ def euroc_camera(root: Section, name: str) -> CameraSpec:
         rate_hz=root.number("rate_hz", 0.0, minimum=0.0),
         time_offset_s=root.number("time_offset_s", 0.0),
         row_time_s=root.number("row_time_s", 0.0, minimum=0.0),
+        stamped_row=root.number("stamped_row", 0.0, minimum=0.0),
         exposure_s=root.number("exposure_s", 0.0, minimum=0.0),
     )
 

@@ -127,8 +127,8 @@ def written_stamps(sensor: Path) -> list[int]:
 
 
 def camera_yaml(spec: CameraSpec, comment: str = "") -> str:
-    """A camera's `sensor.yaml`; time offset, row time and exposure only where the spec has them."""
-    timing = {key: getattr(spec, key) for key in ("time_offset_s", "row_time_s", "exposure_s")}
+    """A camera's `sensor.yaml`; time offset, shutter and exposure only where the spec has them."""
+    timing = {key: getattr(spec, key) for key in ("time_offset_s", "row_time_s", "stamped_row", "exposure_s")}
     keys = {"rate_hz": spec.rate_hz, **_lens_keys(spec.camera), **{k: v for k, v in timing.items() if v}}
     return _yaml("camera", comment, spec.T_body_cam, keys)
 

@@ -11,6 +11,7 @@ T_body_cam = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 rate_hz = 20.0                        # optional, like all that follow
 time_offset_s = 0.0                   # is added to its stamps
 row_time_s = 0.0                      # 0: global shutter
+stamped_row = 0.0                     # that is exposed at the stamp
 exposure_s = 0.0
 
 [depth]                               # optional
@@ -114,6 +115,7 @@ def _camera(section: Section, name: str) -> CameraSpec:
         rate_hz=section.number("rate_hz", 0.0, minimum=0.0),
         time_offset_s=section.number("time_offset_s", 0.0),
         row_time_s=section.number("row_time_s", 0.0, minimum=0.0),
+        stamped_row=section.number("stamped_row", 0.0, minimum=0.0),
         exposure_s=section.number("exposure_s", 0.0, minimum=0.0),
     )
     section.only_known()
@@ -154,7 +156,7 @@ def _lens_keys(camera: Camera) -> dict[str, Any]:
 
 
 def _camera_keys(spec: CameraSpec) -> dict[str, Any]:
-    timing = ("rate_hz", "time_offset_s", "row_time_s", "exposure_s")
+    timing = ("rate_hz", "time_offset_s", "row_time_s", "stamped_row", "exposure_s")
     return {
         "name": spec.name,
         **_lens_keys(spec.camera),

@@ -66,8 +66,7 @@ def _built_in_rig(path: Path) -> Rig:
     row_time_s = 0.0 if found[1] == "3" else KINECT_ROW_TIME_S  # the third was an Asus Xtion
     depth = DepthSpec(camera, SE3.identity(), units_per_m=UNITS_PER_M)
     # The driver, ROS's openni_camera, stamps an image when it has arrived, which is after its last row was read.
-    late_s = row_time_s * camera.height
-    colour = CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s, time_offset_s=-late_s)
+    colour = CameraSpec("cam0", camera, SE3.identity(), row_time_s=row_time_s, stamped_row=float(camera.height))
     return Rig((colour,), depth=depth)
 
 
