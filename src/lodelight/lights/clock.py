@@ -93,13 +93,14 @@ class ClockCheck:
             )
             misfit = (turned - expected + math.pi) % (2.0 * math.pi) - math.pi
             cost[i] = np.minimum(misfit**2 / variance, OUTLIER_2).sum()
-        return _least(tried, cost, len(rows))
+        overlap = max(1.0, len(rows) * TURN_S / (t[rows[-1]] - t[first[0]]))  # each fix is in so many turns
+        return _least(tried, cost / overlap, len(rows) / overlap)
 
     def _heading(self, R: Array) -> float:
         return math.atan2(R[1, self._axis], R[0, self._axis])
 
 
-def _least(tried: Array, cost: Array, count: int) -> Offset | None:
+def _least(tried: Array, cost: Array, count: float) -> Offset | None:
     """By a parabola through the least cost and its neighbours; None where none does as well, or the end does best."""
     best = int(np.argmin(cost))
     if best in (0, len(tried) - 1):
