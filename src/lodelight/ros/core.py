@@ -93,8 +93,7 @@ class NodeCore:
             raise ConfigError(f"mode {config.mode!r} is unknown; choose slam or localize")
         self.rig, self.config, self.publish, self.tell = rig, config, publish, tell
         self.T_body_base = (T_base_body or SE3.identity()).inverse()
-        sensors = config.sensors or rig.sensors
-        self.sensors = sensors.removesuffix("-inertial") if config.mode == "localize" else sensors
+        self.sensors = config.sensors or rig.sensors
         visual = self.sensors.partition("-")[0]
         self.partners = Partners(2 if visual == "stereo" else 1, visual == "rgbd")
         self.frames = self.dropped = 0
