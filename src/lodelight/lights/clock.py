@@ -21,7 +21,7 @@ REACH_S, STEP_S = 0.4, 0.01  # offsets that are tried
 FLOOR_RAD = math.radians(0.1)  # of a heading, on either side
 FEWEST = 20  # turns
 OUTLIER_2 = 9.0  # squared sigmas at which a turn's misfit counts no more
-CLEARLY = 25.0  # by which an offset must fit better than none, in squared sigmas
+CLEARLY = 9.0  # by which an offset must fit better than none, in squared sigmas
 LEAST_S = 0.015  # offsets below it move a fix by less than its own error
 NS = 1e-9
 
