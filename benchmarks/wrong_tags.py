@@ -34,13 +34,13 @@ def main(wanted: int) -> None:
             if len(done) == wanted:
                 break
         seed += 1
-    print("| wrong tag | trials | had a say | named in frame 1, 2, 3, not |")
-    print("| --- " * 4 + "|")
+    print("| wrong tag | trials | had a say | named in frame 1, 2, 3, not | window lost |")
+    print("| --- " * 5 + "|")
     for kind in WRONG:
         mine = [t for t in done if t.kind == kind]
         named = Counter(t.named for t in mine)
         when = ", ".join(str(named[k]) for k in (1, 2, 3, 0))
-        print(f"| {kind} | {len(mine)} | {sum(t.used > 0 for t in mine)} | {when} |")
+        print(f"| {kind} | {len(mine)} | {sum(t.used > 0 for t in mine)} | {when} | {sum(t.lost for t in mine)} |")
 
 
 if __name__ == "__main__":

@@ -145,12 +145,15 @@ def wrongly_hung(walk: TaggedWalk, t_ns: int, kind: str, rng: np.random.Generato
 
 @dataclass(frozen=True)
 class Trial:
-    """kind; sights : of the wrong tag; used : of those in the window's solution; named : at which, 0 = not"""
+    """kind; sights : of the wrong tag; used : of those in the window's solution; named : at which, 0 = not
+    lost : the window ended in the trial
+    """
 
     kind: str
     sights: int
     used: int
     named: int
+    lost: bool = False
 
 
 def trials(walk: TaggedWalk, kinds: Sequence[str], every: int, rng: np.random.Generator) -> Iterator[Trial]:
@@ -194,8 +197,9 @@ def _trial(
             break
         copied.feed_frame(message, [*true, sighting])
         copied.flush()
-        assert copied.window is not None
         seen += 1
+        if copied.window is None:
+            return Trial(kind, seen, used, named, lost=True)
         used += any(v.view.id == name and v.use for v in copied.window.frames[-1].tags)
         named = named or (seen if name in told else 0)
     return Trial(kind, seen, used, named) if seen == 3 else None
