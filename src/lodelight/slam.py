@@ -269,15 +269,15 @@ class Slam:
         orb, config = self.config.orb, self.config
         self.map = map
         self.tracker = Tracker(map.rig, map, orb, config.tracking, config.seed)
-        self.lights = _light_anchor(map, config, self.anchors, self.emit)
-        gated = self.lights is not None and config.gate.use == "lights"
-        self.gates = (*self.more_gates, self.lights.ask) if self.lights and gated else self.more_gates
+        upright = config.sensors.endswith("-inertial")
+        self.lights = _light_anchor(map, config, self.anchors, self.emit, upright)
+        asks = self.lights if config.gate.use == "lights" else None
+        self.gates = (*self.more_gates, asks.ask) if asks else self.more_gates
         places = Places(map)
         find = Relocalizer(map, orb, places).find
         self.machine = LocalizationMachine(self.tracker, find)
         self.mapper = LocalMapper(map, orb, config.mapping)
         self.loops = LoopCloser(map, orb, places, config.loops, self.emit)
-        upright = config.sensors.endswith("-inertial")
         self.tags = MapTags(map, orb, config.mapping.sigma_px, self.anchors.tags, config.tags, self.emit, upright)
         self.path: list[PathNode] = []
         return find
@@ -449,7 +449,9 @@ class Slam:
         )  # fmt: skip
 
 
-def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSink) -> LightAnchor | None:
+def _light_anchor(
+    map: Map, config: SlamConfig, anchors: Anchors, emit: EventSink, upright: bool
+) -> LightAnchor | None:  # fmt: skip
     """None where lights are not asked for. Raises ConfigError where they would be used twice."""
     gated, tight = config.gate.use == "lights", config.lights.use == "tight"
     if gated and tight:
@@ -460,5 +462,4 @@ def _light_anchor(map: Map, config: SlamConfig, anchors: Anchors, emit: EventSin
         raise ConfigError("tight lights need a light camera in the rig and [[light]] entries in the anchors")
     if not gated and not tight:
         return None
-    upright = config.sensors.endswith("-inertial")
     return LightAnchor(map, config.gate, config.lights, anchors.lights, emit, upright)

@@ -74,6 +74,10 @@ class SE3:
         """Angle of the rotation, rad."""
         return float(rotation_angle(self.R))
 
+    def exceeds(self, m: float, deg: float) -> bool:
+        """Whether it moves by more than m, or turns by more than deg."""
+        return float(np.linalg.norm(self.t)) > m or math.degrees(self.angle) > deg
+
     def inverse(self) -> SE3:
         Rt = np.ascontiguousarray(self.R.T)
         return SE3(Rt, -Rt @ self.t)

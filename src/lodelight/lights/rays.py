@@ -70,10 +70,9 @@ def lay_down(tracks: Sequence[Track], lights: Mapping[str, Light], up_map: Array
 
     up_map : (3,) unit, the direction of world z in the map, and its sigma about either horizontal axis
     """
-    met = [(track, place) for track in tracks if (place := meeting(track.centres, track.directions)) is not None]
-    if len(met) < LIGHTS:
+    kept, places = _met(tracks)
+    if len(kept) < LIGHTS:
         return None
-    kept, places = [track for track, _ in met], np.array([place for _, place in met])
     found: dict[tuple[str, ...], SE3] = {}
     for T in _starts(kept, places, lights, up_map):
         found.setdefault(_names(T, kept, places, lights), T)
@@ -89,10 +88,9 @@ def settle(
     T: SE3, tracks: Sequence[Track], lights: Mapping[str, Light], up_map: Array, sigma_up_rad: float
 ) -> Laid | None:
     """The place of a map that is known roughly, T_world_map, by all lights followed in it; None as in `lay_down`."""
-    met = [(track, place) for track in tracks if (place := meeting(track.centres, track.directions)) is not None]
-    if not met:
+    kept, places = _met(tracks)
+    if not kept:
         return None
-    kept, places = [track for track, _ in met], np.array([place for _, place in met])
     laid: Laid | None = None
     for _ in range(ROUNDS):  # lights far from those that fit at first come within reach as the map turns
         names = _names(T, kept, places, lights)
@@ -101,6 +99,12 @@ def settle(
             return None
         T = laid.T_world_map
     return laid if laid is not None and _enough(len(laid.lights), len(kept)) else None
+
+
+def _met(tracks: Sequence[Track]) -> tuple[list[Track], Array]:
+    """The tracks whose rays meet, and where (N, 3), map frame."""
+    met = [(track, place) for track in tracks if (place := meeting(track.centres, track.directions)) is not None]
+    return [track for track, _ in met], np.array([place for _, place in met])
 
 
 def _enough(fitting: int, of: int) -> bool:

@@ -245,7 +245,7 @@ class MapTags:
         if not len(rows):
             return True
         T = pose_of_view(self.map, int(rows[-1])).inverse() @ T_map_body
-        return float(np.linalg.norm(T.t)) > self.config.apart_m or math.degrees(T.angle) > self.config.apart_deg
+        return T.exceeds(self.config.apart_m, self.config.apart_deg)
 
     # -- places -------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,6 @@ agree on one of them.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -75,7 +74,7 @@ class NewTags:
         if settled is not None:
             return T_map_cam @ settled.T_cam_tag
         views = [v for v in self.seen.get(s.name, ()) if (s.t_ns - v.sighting.t_ns) * 1e-9 < OLD_S]
-        if views and not _apart(views[-1].T_world_cam, T_map_cam):
+        if views and not (views[-1].T_world_cam.inverse() @ T_map_cam).exceeds(APART_M, APART_DEG):
             return None
         views = self.seen[s.name] = [*views, View(s, T_map_cam)][-MOST_VIEWS:]
         found = map_tag(views, s.size_m, self.camera)
@@ -86,8 +85,3 @@ class NewTags:
         self.seen = {
             name: [View(v.sighting, T_new_old @ v.T_world_cam) for v in views] for name, views in self.seen.items()
         }
-
-
-def _apart(a: SE3, b: SE3) -> bool:
-    T = a.inverse() @ b
-    return float(np.linalg.norm(T.t)) > APART_M or math.degrees(T.angle) > APART_DEG
