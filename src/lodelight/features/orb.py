@@ -9,6 +9,7 @@ pairs); Foerstner and Guelch 1987 (sub-pixel corner).
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -19,7 +20,7 @@ import numpy as np
 from lodelight.compiled import kernel
 from lodelight.features.features import Features
 from lodelight.geometry.cameras import Camera
-from lodelight.types import AnyArray, Array, ArrayF32, Bytes, Ints, Words
+from lodelight.types import Array, ArrayF32, Bytes, Ints, Words
 
 PATCH_RADIUS = 15
 BORDER = PATCH_RADIUS + 2
@@ -65,23 +66,25 @@ class OrbExtractor:
 
     def extract(self, pyramid: list[Bytes]) -> Features:
         """Corners of all levels of `pyramid(image)`, described; without depth."""
+        found = list(_two_at_once().map(self._of_level, pyramid, self._quota))
         height, width = pyramid[0].shape
-        found = []
-        for octave, level in enumerate(pyramid):
-            corners = self._corners(level, self._quota[octave])
-            smooth = np.asarray(cv2.GaussianBlur(level, (7, 7), 2.0, borderType=cv2.BORDER_REFLECT_101), np.uint8)
-            angle = orientations(level, corners)
-            desc = describe(smooth, corners, angle, _turned_pairs())
-            scale = np.array([width / level.shape[1], height / level.shape[0]])
-            px = (
-                refine_corners(level, corners) + 0.5
-            ) * scale - 0.5  # a resized image keeps its edges, not its centres
-            found.append((px, np.full(len(px), octave, np.int32), angle, desc))
-        px, octave_of, angle, desc = (np.concatenate(column) for column in zip(*found, strict=True))
+        for (px, _, _), level in zip(found, pyramid, strict=True):
+            # a resized image keeps its edges, not its centres
+            px[:] = (px + 0.5) * np.array([width / level.shape[1], height / level.shape[0]]) - 0.5
+        octave_of = np.repeat(np.arange(len(found), dtype=np.int32), [len(px) for px, _, _ in found])
+        px, angle, desc = (np.concatenate(column) for column in zip(*found, strict=True))
         ray, seen = self.camera.unproject(px)
         no_depth = np.zeros(len(px), np.float32)
         features = Features(px.astype(np.float32), octave_of, angle, desc, ray, no_depth, no_depth)
         return features if seen.all() else features.take(seen)
+
+    def _of_level(self, level: Bytes, quota: int) -> tuple[Array, ArrayF32, Words]:
+        """The corners of one level: px (N, 2) of that level, directions (N,) and descriptors (N, 4)."""
+        corners = self._corners(level, quota)
+        smooth = np.asarray(cv2.GaussianBlur(level, (7, 7), 2.0, borderType=cv2.BORDER_REFLECT_101), np.uint8)
+        angle = orientations(level, corners)
+        desc = describe(smooth, corners, angle, _pair_offsets(level.shape[1]))
+        return refine_corners(level, corners), angle, desc
 
     def _corners(self, level: Bytes, quota: int) -> Ints:
         """(N, 2) int pixels: the strongest corner of every cell, then the second of every cell, up to the quota."""
@@ -98,16 +101,20 @@ class OrbExtractor:
 
 
 @cache
-def _turned_pairs() -> AnyArray:
-    """The descriptor's pairs (x1, y1, x2, y2) turned to N_ANGLES directions, (N_ANGLES, 256, 4) int8."""
+def _two_at_once() -> ThreadPoolExecutor:
+    """For the levels of a pyramid: none needs another, and all that is slow about them releases the GIL."""
+    return ThreadPoolExecutor(2, thread_name_prefix="corners")
+
+
+@cache
+def _pair_offsets(width: int) -> Ints:
+    """(N_ANGLES, 256, 2): the descriptor's pairs turned to N_ANGLES directions, as offsets in an image that wide."""
     pairs = np.load(str(files("lodelight") / "data" / "descriptor_pairs.npy")).astype(np.float64)
     angle = 2.0 * np.pi * np.arange(N_ANGLES) / N_ANGLES
     c, s = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
     x, y = pairs[None, :, 0::2], pairs[None, :, 1::2]
-    out = np.empty((N_ANGLES, len(pairs), 4), np.int8)
-    out[..., 0::2] = np.rint(c * x - s * y)
-    out[..., 1::2] = np.rint(s * x + c * y)
-    return out
+    offsets: Ints = (np.rint(s * x + c * y) * width + np.rint(c * x - s * y)).astype(np.int32)
+    return offsets
 
 
 def spread(px: Ints, response: ArrayF32, cell_px: float, width: int, height: int, quota: int) -> Ints:
@@ -155,17 +162,18 @@ def orientations(image: Bytes, px: Ints) -> ArrayF32:
 
 
 @kernel
-def describe(smooth: Bytes, px: Ints, angle: ArrayF32, turned_pairs: AnyArray) -> Words:
+def describe(smooth: Bytes, px: Ints, angle: ArrayF32, pair_offsets: Ints) -> Words:
     """(N, 4) uint64 descriptors: one bit a pair, set where the first pixel of the pair is darker."""
     out = np.zeros((len(px), 4), np.uint64)
+    pixels = smooth.reshape(-1)
     for i in range(len(px)):
-        x, y = px[i, 0], px[i, 1]
-        pairs = turned_pairs[int(np.rint(angle[i] * (N_ANGLES / (2.0 * math.pi)))) % N_ANGLES]
+        centre = px[i, 1] * smooth.shape[1] + px[i, 0]
+        offsets = pair_offsets[int(np.rint(angle[i] * (N_ANGLES / (2.0 * math.pi)))) % N_ANGLES]
         for word in range(4):
             bits = np.uint64(0)
             for k in range(64):
-                p = pairs[64 * word + k]
-                darker = smooth[y + p[1], x + p[0]] < smooth[y + p[3], x + p[2]]
+                p = offsets[64 * word + k]
+                darker = pixels[np.uint64(centre + p[0])] < pixels[np.uint64(centre + p[1])]
                 bits |= np.uint64(darker) << np.uint64(k)
             out[i, word] = bits
     return out
