@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from conftest import shared_data
+from lodelight.features.corners import find_corners, strengths
 from lodelight.features.depth import depth_of_features
 from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
@@ -67,6 +68,26 @@ def test_corners_are_spread_over_image_and_scales(size):
     assert 900 <= len(seen) <= 1010
     assert cells.all()
     assert len(np.unique(seen.octave)) == min(8, len(extractor.pyramid(textured(1, size[1], size[0]))))
+
+
+@pytest.mark.parametrize("threshold", [5, 7, 40])
+def test_corners_are_those_of_fast_the_best_of_every_cell_first(threshold):
+    quota, border = 150, 17
+    image = cv2.GaussianBlur(textured(4, 240, 376), (0, 0), 1.0)
+    image[:, 200:] //= 6  # faint, where cells have few or none
+    inside = image[border:-border, border:-border]
+    found = cv2.FastFeatureDetector.create(threshold, True).detect(inside)
+    strength = strengths(image, border + 3)
+    cell_px, ranked, taken = np.sqrt(inside.size / quota), [], {}
+    for corner in sorted(found, key=lambda c: -c.response):  # stable: row by row where alike
+        x, y = (int(v) for v in corner.pt)
+        assert strength[y + border, x + border] == corner.response + 1
+        cell = (int(x / cell_px), int(y / cell_px))
+        taken[cell] = taken.get(cell, -1) + 1
+        ranked.append((taken[cell], x + border, y + border))
+    wanted = [corner[1:] for corner in sorted(ranked, key=lambda r: r[0])][:quota]
+    np.testing.assert_array_equal(find_corners(image, quota, threshold, border), wanted)
+    assert len(wanted) == (quota if threshold < 40 else len(found))
 
 
 def test_blank_image_has_no_corner_and_breaks_nothing():

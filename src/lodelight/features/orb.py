@@ -2,8 +2,8 @@
 
 The descriptor compares 256 pairs of pixels of the smoothed patch, turned by the patch's orientation. The pairs were
 chosen on real and rendered images by `tools/train_descriptor.py` and lie in `data/descriptor_pairs.npy`.
-Sources: Rosten and Drummond 2006 (FAST); Rublee et al. 2011 (oriented BRIEF, intensity centroid, greedy choice of
-pairs); Foerstner and Guelch 1987 (sub-pixel corner).
+Sources: Rublee et al. 2011 (oriented BRIEF, intensity centroid, greedy choice of pairs); Foerstner and Guelch 1987
+(sub-pixel corner).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from lodelight.compiled import kernel
+from lodelight.features.corners import find_corners
 from lodelight.features.features import Features
 from lodelight.geometry.cameras import Camera
 from lodelight.types import Array, ArrayF32, Bytes, Ints, Words
@@ -50,7 +51,6 @@ class OrbExtractor:
         self.config = config or OrbConfig()
         share = self.config.scale_factor ** -np.arange(self.config.n_levels)
         self._quota = np.maximum(1, np.rint(self.config.n_features * share / share.sum())).astype(int)
-        self._fast = cv2.FastFeatureDetector.create(self.config.fast_threshold, True)
 
     def pyramid(self, image: Bytes) -> list[Bytes]:
         """The image and its reductions by the scale factor; levels too small for a patch are left out."""
@@ -80,24 +80,11 @@ class OrbExtractor:
 
     def _of_level(self, level: Bytes, quota: int) -> tuple[Array, ArrayF32, Words]:
         """The corners of one level: px (N, 2) of that level, directions (N,) and descriptors (N, 4)."""
-        corners = self._corners(level, quota)
+        corners = find_corners(level, quota, self.config.fast_threshold, BORDER)
         smooth = np.asarray(cv2.GaussianBlur(level, (7, 7), 2.0, borderType=cv2.BORDER_REFLECT_101), np.uint8)
         angle = orientations(level, corners)
         desc = describe(smooth, corners, angle, _pair_offsets(level.shape[1]))
         return refine_corners(level, corners), angle, desc
-
-    def _corners(self, level: Bytes, quota: int) -> Ints:
-        """(N, 2) int pixels: the strongest corner of every cell, then the second of every cell, up to the quota."""
-        inner = level[BORDER:-BORDER, BORDER:-BORDER]
-        keypoints = self._fast.detect(inner)
-        if not keypoints:
-            return np.zeros((0, 2), np.int32)
-        px = np.rint(cv2.KeyPoint.convert(keypoints)).astype(np.int32)
-        response = np.array([k.response for k in keypoints], np.float32)
-        height, width = inner.shape
-        cell_px = math.sqrt(height * width / quota)
-        chosen: Ints = px[spread(px, response, cell_px, width, height, quota)] + np.int32(BORDER)
-        return chosen
 
 
 @cache
@@ -115,28 +102,6 @@ def _pair_offsets(width: int) -> Ints:
     x, y = pairs[None, :, 0::2], pairs[None, :, 1::2]
     offsets: Ints = (np.rint(s * x + c * y) * width + np.rint(c * x - s * y)).astype(np.int32)
     return offsets
-
-
-def spread(px: Ints, response: ArrayF32, cell_px: float, width: int, height: int, quota: int) -> Ints:
-    """Indices of at most `quota` corners, taken round by round: the best of every cell, the second best, and so on."""
-    order = np.argsort(-response, kind="stable").astype(np.int32)
-    rounds = _rounds(px, order, cell_px, width, height)
-    out: Ints = order[np.argsort(rounds, kind="stable")[:quota]]
-    return out
-
-
-@kernel
-def _rounds(px: Ints, order: Ints, cell_px: float, width: int, height: int) -> Ints:
-    """(N,) how many corners of its own cell come before each corner of `order`."""
-    columns = int(width / cell_px) + 1
-    taken = np.zeros(columns * (int(height / cell_px) + 1), np.int32)
-    out = np.empty(len(order), np.int32)
-    for k in range(len(order)):
-        i = order[k]
-        cell = int(px[i, 1] / cell_px) * columns + int(px[i, 0] / cell_px)
-        out[k] = taken[cell]
-        taken[cell] += 1
-    return out
 
 
 @kernel
