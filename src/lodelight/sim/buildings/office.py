@@ -90,7 +90,7 @@ def _meeting_room(b: Builder) -> None:
     sofa(b, 13.3, 7.35, 0)
     plant(b, 19.4, 7.5)
     plant(b, 12.5, 0.5)
-    b.decal(19.94, 3.4, 1.6, 180, (2.4, 1.2), prints.board(b.random("board"), cork=False))
+    b.decal(19.94, 3.4, 1.6, 180, (2.4, 1.2), prints.board(b.random("board", int(b.changed)), cork=False))
 
 
 def _north_rooms(b: Builder) -> None:
@@ -125,8 +125,7 @@ def _pictures(b: Builder) -> None:
         *((x, 10.06, 90) for x in (1.0, 5.6, 13.2, 18.4)),
     ]  # fmt: skip
     for i, (x, y, yaw) in enumerate(spots):
-        chance = b.random(f"poster change {i}").random()
-        rng = b.random(f"poster {i}", int(b.changed and chance < 0.6))
+        rng = b.random(f"poster {i}", int(b.changed))
         kind = rng.random()
         z = float(rng.uniform(1.45, 1.7))
         if kind < 0.6:
