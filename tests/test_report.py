@@ -66,7 +66,7 @@ def test_the_page_draws_every_plot_without_error_or_request(tmp_path, truth):
     counts = drawn(dom)
     assert set(counts) == FLAT_PLOTS | {"map"} | (TRUTH_PLOTS if truth else set())
     assert all(counts[name] >= 1 for name in counts if name != "map"), counts
-    assert counts["above"] == (6 if truth else 5)  # map points, truth, live, final, keyframes, tags
+    assert counts["above"] == (8 if truth else 7)  # map points, truth, live, final, two states, keyframes, tags
     assert dom.count("T07") >= 2  # beside its tag, from above and from the side
     assert counts["bias-gyro"] == 9  # three axes, each with its band
     assert counts["velocity"] == (5 if truth else 4)  # three axes, speed, true speed

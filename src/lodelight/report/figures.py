@@ -112,7 +112,13 @@ def inliers(run: RunFolder) -> Figure:
     t_ns = np.array(run.frames["t_ns"], dtype=np.int64)
     count = np.array(run.frames["inliers"], dtype=float)
     rows = thinned(len(count), -count)
-    return over_time([line(run.seconds(t_ns[rows]), count[rows], "inliers", FINAL)], "map points matched")
+    traces = [line(run.seconds(t_ns[rows]), count[rows], "inliers", FINAL)]
+    temporary = run.column("temporary")
+    if temporary is not None and temporary[1].any():
+        t_s, count = temporary
+        rows = thinned(len(count), count)
+        traces.append(line(t_s[rows], count[rows], "temporary points", STATE_COLOURS["degraded"]))
+    return over_time(traces, "points matched")
 
 
 def sigma(run: RunFolder) -> Figure:
@@ -213,6 +219,9 @@ def plane(run: RunFolder, axes: str) -> Figure:
     for path, name, colour, width in ((run.live, "live", LIVE, 1), (run.final, "final", FINAL, 2)):
         (xyz,) = broken(path.poses.t_ns, thinned(len(path.poses)), path.poses.xyz)
         traces.append(line(xyz[:, i], xyz[:, j], name, colour, line={"width": width}))
+    for state, xyz in along(run).items():
+        marks = {"mode": "markers", "marker": {"color": STATE_COLOURS[state], "size": 5}}
+        traces.append(line(xyz[:, i], xyz[:, j], state, STATE_COLOURS[state], **marks))
     xyz = keyframes(run)
     marks = {"mode": "markers", "marker": {"color": FINAL, "size": 4, "symbol": "square-open"}}
     traces.append(line(xyz[:, i], xyz[:, j], "keyframes", FINAL, **marks))
@@ -237,6 +246,10 @@ def space(run: RunFolder) -> Figure:
         {"name": "path", "mode": "lines", "line": {"color": FINAL, "width": 4}, **_xyz(path)},
         {"name": "keyframes", "mode": "markers", "marker": {"size": 2.5, "color": LIVE}, **_xyz(keyframes(run))},
     ]
+    for state, xyz in along(run).items():
+        traces.append(
+            {"name": state, "mode": "markers", "marker": {"size": 3, "color": STATE_COLOURS[state]}, **_xyz(xyz)}
+        )
     names, spots = tags(run)
     if names:
         marker = {"size": 5, "color": TAG, "symbol": "square"}
@@ -271,6 +284,15 @@ def keyframes(run: RunFolder) -> Array:
     stamps = [e["t_ns"] for e in run.events if e.get("kind") == "keyframe" and e.get("inserted")]
     rows = np.flatnonzero(np.isin(run.final.poses.t_ns, np.array(stamps, dtype=np.int64)))
     return run.final.poses.xyz[rows[thinned(len(rows))]]
+
+
+def along(run: RunFolder) -> dict[str, Array]:
+    """Where the live path was in each state but that of plain tracking, (N, 3) m."""
+    poses = run.live.poses
+    frame = np.searchsorted(np.array(run.frames["t_ns"], dtype=np.int64), poses.t_ns)
+    status = np.array(run.frames["status"])[frame]
+    found = {state: poses.xyz[status == state] for state in get_args(Status) if state != "tracking"}
+    return {state: xyz[thinned(len(xyz))] for state, xyz in found.items() if len(xyz)}
 
 
 def _xyz(points: AnyArray) -> Figure:

@@ -79,7 +79,7 @@ def _plots(run: RunFolder) -> dict[str, tuple[str, str, bool, Figure]]:
     if run.frames["t_ns"]:
         note = "Tracking: from the decoded image to its pose. Mapping: what a keyframe costs besides."
         drawn["timing"] = ("Time per frame", note, False, figures.timing(run))
-        drawn["inliers"] = ("Inliers", "Map points that agree with the frame's pose.", False, figures.inliers(run))
+        drawn["inliers"] = ("Inliers", "Points that agree with the frame's pose.", False, figures.inliers(run))
     speed = figures.velocity(run)
     if speed:
         drawn["velocity"] = ("Velocity", "As estimated at the time, world axes.", False, speed)
