@@ -51,13 +51,15 @@ def test_frames_between_the_mapped_ones_are_localized_and_the_map_file_is_untouc
     assert (tmp_path / "report.html").stat().st_size > 100_000
 
 
-def test_a_single_image_is_localized(kitchen, tmp_path):
+def test_a_single_image_is_localized(kitchen, tmp_path, capsys):
     source = shared_data("redkitchen")
     photo = tmp_path / "photo.jpg"
     shutil.copy(source / "frame-000075.color.jpg", photo)
     write_rig(tmp_path / "camera.toml", open_source(source).rig.with_cameras(1))
     assert localize(photo, "--map", kitchen, "--rig", tmp_path / "camera.toml", "--out", tmp_path / "out") == 0
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["relocalizations"] == 1
+    assert "looking along" in capsys.readouterr().out
+    assert '"relocalized","x":{"dtype"' in (tmp_path / "out" / "report.html").read_text()  # on the map, from above
 
 
 def test_mistakes_get_one_line_and_exit_status_2(kitchen, tmp_path, capsys):

@@ -7,6 +7,7 @@ import pytest
 
 from corridors import MAPPING, ORB, OTHER, Corridor, walk
 from lodelight.geometry.se3 import SE3
+from lodelight.localization.backwards import Backwards
 from lodelight.localization.beside import ThreadedSearch
 from lodelight.localization.follower import n_temporary
 from lodelight.localization.ladder import Ladder, LadderConfig
@@ -287,3 +288,27 @@ def test_where_points_are_few_those_of_which_the_distance_is_only_supposed_get_o
     assert found < 5
     assert set(status[found + 3 :]) == {"degraded"}
     assert max(off_m[found:]) < 0.1
+
+
+def test_frames_before_a_camera_was_found_are_followed_back_from_there():
+    """It is asked for only behind a stretch that was redecorated."""
+    built = Corridor.built(3)
+    map = built.mapped(3)
+    now = built.redecorated(5.0, 12.0, seed=1003)
+
+    def begun(rig):
+        return Ladder(rig, map, ORB, LadderConfig(), 0, True, False, lambda *_, **__: None)
+
+    ladder, backwards, rng = begun(OTHER), Backwards(OTHER, begun), np.random.default_rng(8)
+    true = {i * S // 10: walk(x, 0.3 * np.sin(0.4 * x), 0.0) for i, x in enumerate(np.arange(5.0, 14.0, 0.08))}
+    for t_ns, T_world_body in true.items():
+        seen, _ = now.seen(OTHER, T_world_body, rng)
+        if T_world_body.t[0] > 12.0 and not (tracked := ladder.locate(t_ns, seen)).why_lost:
+            break
+        backwards.wait(t_ns, seen)
+    poses = dict(backwards.follow(tracked))
+    assert len(poses) >= 0.9 * t_ns / (S // 10)
+    assert max(np.linalg.norm(T.t - true[t].t) for t, T in poses.items()) < 0.1
+    assert backwards.created > 0
+    assert backwards.left == 0
+    assert backwards.follow(tracked) == []

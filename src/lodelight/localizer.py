@@ -10,11 +10,13 @@ import numpy as np
 
 from lodelight.compiled import Stopwatch
 from lodelight.errors import CalibrationError, MapError
+from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording
+from lodelight.localization.backwards import Backwards
 from lodelight.localization.follower import n_temporary
 from lodelight.localization.ladder import EventSink, Ladder, LadderConfig
 from lodelight.localization.reckoning import DeadReckoning
@@ -38,12 +40,14 @@ class LocalizerConfig:
 
     sensors : mono, stereo or rgbd, each also with -inertial
     temporary_points : whether they may carry the camera where the map is not enough
+    backwards : whether frames before one that was found are followed back from there; never while live
     hint_reach_m : from how far away the place of a hinted pose may be seen
     """
 
     sensors: str = "mono"
     seed: int = 0
     temporary_points: bool = True
+    backwards: bool = True
     hint_reach_m: float = 3.0
     orb: OrbConfig = field(default_factory=OrbConfig)
     ladder: LadderConfig = field(default_factory=LadderConfig)
@@ -80,6 +84,8 @@ class Localizer:
             rig, map, self.config.orb, self.config.ladder, self.config.seed, self.config.temporary_points, live,
             self._emit, DeadReckoning(rig.imu, self._emit) if inertial and rig.imu is not None else None,
         )  # fmt: skip
+        self.backwards = Backwards(rig, self._another_ladder) if self.config.backwards and not live else None
+        self._earlier: dict[int, SE3] = {}
         self.relocalizations = 0
         self.dropped = 0
 
@@ -119,10 +125,13 @@ class Localizer:
         seen = self.front_end.process(frame)
         tracked = self.ladder.locate(frame.t_ns, seen)
         self.relocalizations += self.ladder.status == "relocalized"
+        track_ms = clock.ms()
+        if self.backwards is not None:
+            self._look_back(self.backwards, tracked, seen)
         details = {
             "temporary": float(n_temporary(tracked)),
             "mono": float(self.ladder.states.state is State.carried),
-            "track_ms": clock.ms(),
+            "track_ms": track_ms,
         }
         return Estimate(
             frame.t_ns, self.ladder.status, tracked.T_world_body, self._covariance(tracked), self.ladder.why,
@@ -134,9 +143,25 @@ class Localizer:
         self.ladder.close()
 
     @property
-    def confirmed(self) -> list[tuple[int, SE3]]:
-        """Poses (t_ns, T_world_body) of frames that were believed only after later ones had agreed."""
-        return self.ladder.confirmed
+    def earlier(self) -> list[tuple[int, SE3]]:
+        """Poses (t_ns, T_world_body) of frames that had none at the time, as what came later tells, by their stamps:
+        those believed only after others had agreed, and those followed back from where the camera was found."""
+        return sorted({**self._earlier, **dict(self.ladder.confirmed)}.items())
+
+    def _look_back(self, backwards: Backwards, tracked: Tracked, seen: Features) -> None:
+        """A frame without a pose waits for one that has a pose, and that one leads back to those that wait."""
+        if tracked.why_lost:
+            backwards.wait(tracked.t_ns, seen)
+        elif poses := backwards.follow(tracked):
+            self._earlier.update(poses)
+            self._emit(tracked.t_ns, "followed_back", frames=len(poses), first_t_ns=poses[-1][0])
+
+    def _another_ladder(self, rig: Rig) -> Ladder:
+        """A ladder at its beginning in the same map, of which nobody is told."""
+        return Ladder(
+            rig, self.map, self.config.orb, self.config.ladder, self.config.seed, self.config.temporary_points,
+            live=False, emit=lambda *_, **__: None, places=self.ladder.relocalizer.places,
+        )  # fmt: skip
 
     def stats(self) -> dict[str, object]:
         """Counts for `metrics.json`."""
@@ -145,7 +170,10 @@ class Localizer:
             "map_points": len(self.map.alive_points),
             "loops": len(self.map.loops),
             "relocalizations": self.relocalizations,
-            "temporary_points": {"created": self.ladder.temporary.created, "left": self.ladder.temporary_left},
+            "temporary_points": {
+                "created": self.ladder.temporary.created + (self.backwards.created if self.backwards else 0),
+                "left": self.ladder.temporary_left + (self.backwards.left if self.backwards else 0),
+            },
             "dropped": self.dropped,
         }
 

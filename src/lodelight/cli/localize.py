@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lodelight.io.recording import Recording
     from lodelight.localizer import LocalizerConfig
     from lodelight.mapping.map import Map
+    from lodelight.rig import Rig
 
 app = typer.Typer(add_completion=False)
 
@@ -63,11 +64,33 @@ def localize(
     config = with_settings(wanted, settings)
     watcher = ViewOptions(view, web, rrd).watcher(recording)
     metrics = localize_to_folder(recording, out, config, known, map_file, live, start, end, watcher)
-    print(json.dumps(metrics, indent=2) if as_json else _summary(metrics, out), flush=True)
+    if as_json:
+        print(json.dumps(metrics, indent=2), flush=True)
+    else:
+        print(_summary(metrics, out))
+        earlier = metrics["final_frames"] - round(metrics["tracked_fraction"] * metrics["frames"])
+        if earlier:
+            print(f"{earlier} more frames by what came later: followed back from where the camera was found")
+        if metrics["frames"] == metrics["final_frames"] == 1:
+            print(_where(recording.rig, out), flush=True)
     if watcher:
         watcher.stay()
     if metrics["tracked_fraction"] == 0.0:
         raise RunError(f"{source}: no frame was found in the map; {out / 'events.jsonl'} says why")
+
+
+def _where(rig: Rig, out: Path) -> str:
+    """Where the camera of a single image stood, and where it looked."""
+    import numpy as np
+
+    from lodelight.io.covariances import read_covariances
+    from lodelight.io.trajectories import read_trajectory
+
+    T_world_cam = read_trajectory(out / "trajectory.tum").pose(0) @ rig.cameras[0].T_body_cam
+    _, covariance = read_covariances(out / "covariance.csv")
+    sigma_m = float(np.sqrt(np.trace(covariance[0, 3:, 3:])))
+    at, along = (", ".join(f"{v:.3f}" for v in vector) for vector in (T_world_cam.t, T_world_cam.R[:, 2]))
+    return f"camera at ({at}) m in the map's frame, to {sigma_m:.3f} m, looking along ({along})"
 
 
 def localize_to_folder(
@@ -115,11 +138,11 @@ def localize_to_folder(
         wall_s = time.perf_counter() - begun_s
         for skipped in recording.skipped:
             outputs.event(skipped.t_ns, "skipped", where=skipped.where, why=skipped.reason)
-        final = sorted([*poses, *localizer.confirmed], key=lambda pose: pose[0])
+        final = sorted([*poses, *localizer.earlier], key=lambda pose: pose[0])
         return outputs.finish(
             Trajectory.from_poses([t for t, _ in final], [T for _, T in final]),
             known.points.xyz[known.alive_points],
-            {**localizer.stats(), "skipped": len(recording.skipped)},
+            {**localizer.stats(), "skipped": len(recording.skipped), "final_frames": len(final)},
             recording.ground_truth(), wall_s=wall_s, compile_s=compile_seconds() - compiled_s,
             recording_s=(last_ns - (first_ns or last_ns)) * 1e-9,
         )  # fmt: skip

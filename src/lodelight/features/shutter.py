@@ -31,11 +31,11 @@ class Shutter:
 
     @property
     def rolls(self) -> bool:
-        return self.row_time_s > 0.0
+        return self.row_time_s != 0.0
 
     @property
     def readout_s(self) -> float:
-        return self.row_time_s * self.camera.height
+        return abs(self.row_time_s) * self.camera.height
 
     def straightened(self, seen: Features, twist: Array) -> Features:
         """Corners as they would be at the stamp, some of them past the image's rim (see BEYOND).

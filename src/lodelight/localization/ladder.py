@@ -25,6 +25,7 @@ from lodelight.localization.temporary import TemporaryConfig, TemporaryPoints
 from lodelight.localization.tracker import Tracked, TrackerConfig
 from lodelight.localization.window import adjust_window
 from lodelight.mapping.map import Map
+from lodelight.mapping.places import Places
 from lodelight.messages import Status
 from lodelight.rig import Rig
 from lodelight.types import Ints
@@ -90,13 +91,14 @@ class Ladder:
     carrying : whether temporary points may be used; live : the search beside on its own thread
     emit : told of what happens, as emit(t_ns, kind, **fields)
     reckoning : by the rig's IMU, None without one; its samples are added to it before the frames
+    places : what recognises them, if another ladder in this map has it already
     status, why : of the last frame, in the words of `Estimate`
     confirmed : (t_ns, T_world_body) of frames that were believed only after later ones had agreed
     """
 
     def __init__(
         self, rig: Rig, map: Map, orb: OrbConfig, config: LadderConfig, seed: int, carrying: bool, live: bool,
-        emit: EventSink, reckoning: DeadReckoning | None = None,
+        emit: EventSink, reckoning: DeadReckoning | None = None, places: Places | None = None,
     ) -> None:  # fmt: skip
         self.map = map
         self.reckoning = reckoning
@@ -104,7 +106,7 @@ class Ladder:
         self.emit = emit
         self.temporary = TemporaryPoints(rig.cameras[0], orb, config.temporary, config.tracking.sigma_px)
         self.follower = Follower(rig, map, orb, config.tracking, self.temporary, seed)
-        self.relocalizer = Relocalizer(map, orb, config=config.relocalization, spec=rig.cameras[0])
+        self.relocalizer = Relocalizer(map, orb, places, config.relocalization, rig.cameras[0])
         self.states = States(config.states, carrying)
         self.status: Status = "initializing"
         self.why = "not found in the map yet"
@@ -115,6 +117,13 @@ class Ladder:
         self._since_asked = 0
         self._pending: list[Tracked] = []  # an answer that waits for another that agrees
         self._known: tuple[int, Hint] | None = None  # where the camera was lost, and when
+
+    def start(self, tracked: Tracked) -> None:
+        """Begin where a frame was found."""
+        self.follower.accept(tracked)
+        self.temporary.forget_past()
+        self.temporary.remember(tracked, tracked.right_in_map >= self.config.states.good_inliers)
+        self.states.found(tracked.t_ns, tracked.right_in_map)
 
     # -- the way of a frame -------------------------------------------------------------------------------------
 
@@ -344,10 +353,7 @@ class Ladder:
         last = self.follower.last
         if last is not None and not self._explained(last, tracked):
             self.follower.forget()  # else the motion since then is worth knowing
-        self.follower.accept(tracked)
-        self.temporary.forget_past()
-        self.temporary.remember(tracked, tracked.right_in_map >= self.config.states.good_inliers)
-        self.states.found(tracked.t_ns, tracked.right_in_map)
+        self.start(tracked)
         self.status, self.why = "relocalized", f"{why}; {tracked.right_in_map} on a second look"
         self.emit(tracked.t_ns, "relocalization", why=self.why, inliers=tracked.n_inliers)
         return tracked
