@@ -2,6 +2,8 @@
 
 blocks RECORDING --length 30    map from even blocks of a recording with depth, queries from odd ones, colour alone
 pair RUN RECORDING QUERY        a recording in the map that `lodelight run RECORDING --out RUN` made
+simulated office --seed 1       renders a stereo recording for the map, another camera on another way, and that one
+                                again in the changed building; maps, and localizes them, the last by the map alone too
 wrong RUN RECORDING QUERY OTHER ...   frames of QUERY, and of other buildings, of which none may be found there
 kidnap RUN RECORDING QUERY      50 times: 10 s of darkness, then another known place
 speed QUERY --keyframes 1000    global relocalization in a map of so many keyframes, of a recording with depth
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -36,6 +39,7 @@ from lodelight.settings import with_settings
 from lodelight.slam import Slam, SlamConfig
 from lodelight.trajectory import Trajectory
 
+MAP_S, QUERY_S = 36, 24  # on foot, side by side; the map goes on to what the query sees at its end
 SIGMA_M, SIGMA_RAD = 0.02, 0.02  # errors of a run: how positions and attitudes weigh when frames are laid together
 
 
@@ -49,7 +53,7 @@ def mapped(recording, frames: list[Frame], sensors: str) -> Slam:
 
 
 class Query:
-    """Frames through a localizer: estimates, and CPU ms of each."""
+    """Frames through a localizer: estimates, poses known in the end, and CPU ms of each frame that was followed."""
 
     def __init__(self, rig, map: Map, frames: Any, given: argparse.Namespace) -> None:
         config = LocalizerConfig(sensors=given.sensors, temporary_points=not given.no_temporary_points)
@@ -64,27 +68,32 @@ class Query:
             start = time.thread_time()
             estimate = self.localizer.feed(Frame(frame.t_ns, frame.images[:1]) if isinstance(frame, Frame) else frame)
             if estimate is not None:
-                self.ms.append(1e3 * (time.thread_time() - start))
+                if estimate.status in ("tracking", "degraded"):
+                    self.ms.append(1e3 * (time.thread_time() - start))
                 self.estimates.append(estimate)
         self.localizer.close()
+        self.earlier = self.localizer.earlier
 
     def errors(self, T_map_truth: SE3, truth: Trajectory) -> tuple[np.ndarray, np.ndarray, list[str]]:
-        """Distance in m and angle in degrees of every localized frame to the truth nearest in time, and its status."""
+        """Distance in m and angle in degrees of every localized frame to the truth at its time, and its status;
+        "earlier" of those that had no pose at the time."""
         off, turn, status = [], [], []
-        for e in self.estimates:
-            if e.localized:
-                apart = (T_map_truth @ truth_at(truth, e.t_ns)).inverse() @ e.T_world_body
-                off.append(float(np.linalg.norm(apart.t)))
-                turn.append(float(np.degrees(apart.angle)))
-                status.append(e.status)
+        at_the_time = [(e.t_ns, e.T_world_body, e.status) for e in self.estimates if e.localized]
+        for t_ns, T_world_body, name in at_the_time + [(*pose, "earlier") for pose in self.earlier]:
+            apart = (T_map_truth @ truth_at(truth, t_ns)).inverse() @ T_world_body
+            off.append(float(np.linalg.norm(apart.t)))
+            turn.append(float(np.degrees(apart.angle)))
+            status.append(name)
         return np.array(off), np.array(turn), status
 
     def told(self) -> str:
         states = Counter(e.status for e in self.estimates)
-        localized = np.mean([e.localized for e in self.estimates])
-        ms = np.array(self.ms)
+        localized = [e.localized for e in self.estimates]
+        before = localized.index(True) if any(localized) else len(localized)
+        ms, final = np.array(self.ms or [0.0]), np.mean(localized) + len(self.earlier) / len(localized)
         return (
-            f"{len(self.estimates)} frames, {localized:.1%} localized ({dict(states)}), "
+            f"{len(localized)} frames, {np.mean(localized):.1%} localized at the time ({dict(states)}; {before} before "
+            f"the first), {final:.1%} in the end, "
             f"CPU ms mean {ms.mean():.1f} p99 {np.percentile(ms, 99):.1f}; "
             f"temporary {self.localizer.stats()['temporary_points']}"
         )
@@ -157,8 +166,34 @@ def against(run: Query, path: Trajectory, truth: Trajectory) -> None:
         within = np.count_nonzero((off <= metres) & (turn <= degrees)) / len(run.estimates)
         print(f"  within {metres} m, {degrees} deg: {within:.1%} of all queries")
     tracking = np.array([s == "tracking" for s in status])
+    if not len(off):
+        return
     print(f"  median {np.median(off):.4f} m {np.median(turn):.3f} deg, largest {off.max():.3f} m {turn.max():.2f} deg")
     print(f"  largest while it says tracking: {off[tracking].max(initial=0.0):.3f} m")
+
+
+def simulated(given: argparse.Namespace) -> None:
+    """Recordings and map are made where they are not there yet; the commands are printed."""
+    name = f"{given.building}_{given.seed}"
+    recording, run, query, changed = (given.out / f"{name}_{what}" for what in ("map", "run", "query", "changed"))
+    rendered = f"sim {given.building} --seed {given.seed} --rate 8 --no-depth --no-lights --threads {given.threads}"
+    other = f"{rendered} --path 3 --motion walk --duration {QUERY_S} --cameras 1 --lens equidistant --size 480x360"
+    made(recording / "contact_sheet.png", f"{rendered} --motion walk --duration {MAP_S}", recording)
+    made(run / "map.lode", f"run {recording} --sensors stereo", run)
+    made(query / "contact_sheet.png", other, query)
+    made(changed / "contact_sheet.png", f"{other} --changed", changed)
+    for where, alone in ((query, False), (changed, False), (changed, True)):
+        print("without temporary points:" if alone else "with temporary points:")
+        pair(argparse.Namespace(**vars(given) | {
+            "run": run, "recording": recording, "query": where, "no_temporary_points": alone,
+        }))  # fmt: skip
+
+
+def made(last: Path, words: str, out: Path) -> None:
+    """Run a command of lodelight for what it writes last, unless that is there."""
+    if not last.exists():
+        print(f"lodelight {words} --out {out}", flush=True)
+        subprocess.run([sys.executable, "-m", "lodelight", *words.split(), "--out", str(out)], check=True)
 
 
 def pair(given: argparse.Namespace) -> None:
@@ -170,8 +205,9 @@ def pair(given: argparse.Namespace) -> None:
     run = Query(rig, map, frames, given)
     print(f"{query.name} in {given.run}, {len(map.alive_keyframes)} keyframes: {run.told()}")
     off, turn, status = run.errors(T_map_truth, query.ground_truth())
-    print(f"  median {np.median(off):.4f} m {np.median(turn):.3f} deg, p95 {np.percentile(off, 95):.3f} m")
-    for name in ("tracking", "degraded", "relocalized"):
+    if len(off):
+        print(f"  median {np.median(off):.4f} m {np.median(turn):.3f} deg, p95 {np.percentile(off, 95):.3f} m")
+    for name in ("tracking", "degraded", "relocalized", "earlier"):
         some = off[[s == name for s in status]]
         if len(some):
             print(f"  {name}: {len(some)}, median {np.median(some):.4f} m, largest {some.max():.3f} m")
@@ -339,10 +375,14 @@ def main() -> None:
     parser = task("blocks", blocks, "recording")
     parser.add_argument("--length", type=int, default=30)
     parser.add_argument("--against-slam", action="store_true", help="not the truth, but SLAM over all frames")
-    parser = task("pair", pair, "run", "recording", "query")
-    parser.add_argument("--end", type=float, default=float("inf"))
-    parser.add_argument("--scale", type=float, default=1.0, help="of the query's images")
-    parser.add_argument("--gaps-m", type=float, default=0.0, help="take every other stretch so long out of the map")
+    for parser in (task("pair", pair, "run", "recording", "query"), task("simulated", simulated)):
+        parser.add_argument("--end", type=float, default=float("inf"))
+        parser.add_argument("--scale", type=float, default=1.0, help="of the query's images")
+        parser.add_argument("--gaps-m", type=float, default=0.0, help="take every other stretch so long out of the map")
+    parser.add_argument("building", choices=["office", "warehouse"])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("simulated"), help="folder for recordings and maps")
+    parser.add_argument("--threads", type=int, default=2, help="images rendered at a time")
     parser = task("wrong", wrong, "run", "recording", "query")
     parser.add_argument("others", type=Path, nargs="*")
     parser.add_argument("--every", type=int, default=1)
