@@ -67,8 +67,8 @@ class TaggedWalk:
         found = TagSighting(t_ns, "tag36h11", id, px, np.full(4, 0.15), size_m=SIZE_M)
         return found if seen.all() and found.side_px >= 14.0 else None
 
-    def look(self, frame: Frame) -> list[TagSighting]:
-        found = [self.sight(frame.t_ns, id, T) for id, T in self.hung.items()]
+    def look(self, frame: Frame, hidden: Callable[[str], bool] = lambda id: False) -> list[TagSighting]:
+        found = [self.sight(frame.t_ns, id, T) for id, T in self.hung.items() if not hidden(id)]
         return [s for s in found if s is not None]
 
     def odometry(self, on_event: Callable[..., None] | None = None) -> InertialOdometry:
@@ -110,17 +110,25 @@ def wall_tags(count: int) -> Iterator[tuple[str, SE3]]:
         yield str(i), SE3(np.column_stack([np.cross(down, into), down, into]), np.array([*at, 1.6]))
 
 
+SIGHTS = 10  # of a wrong tag, at most
 WRONG = ("moved", "duplicated", "misread", "flipped")
+
+
+def apart(id: str) -> bool:
+    """Every other tag is kept for the trials: a wrong one is wrong from its first sight on."""
+    return int(id) % 2 == 1
 
 
 def wrongly_hung(walk: TaggedWalk, t_ns: int, kind: str, rng: np.random.Generator) -> tuple[str, SE3] | None:
     """An id and where the tag that is read so really hangs, in view at t_ns; None where none of the kind is in view.
 
-    moved : a metre from its survey; duplicated : another print somewhere ahead; misread : another tag, taken for it
+    right : where it should; moved : a metre from its survey; duplicated : another print somewhere ahead
+    misread : another tag, taken for it
     flipped : turned into the other of the two poses that its corners allow
     """
     in_view = [id for id, T in walk.hung.items() if walk.sight(t_ns, id, T) is not None]
     away = [id for id in walk.hung if id not in in_view]
+    in_view = [id for id in in_view if apart(id)]
     if kind == "duplicated":
         T_world_cam = walk.truth(t_ns) @ walk.rig.cameras[0].T_body_cam
         ahead = rng.uniform([-0.5, -0.3, 1.5], [0.5, 0.3, 4.0])
@@ -132,9 +140,12 @@ def wrongly_hung(walk: TaggedWalk, t_ns: int, kind: str, rng: np.random.Generato
     T = walk.hung[id]
     if kind == "misread":
         return str(rng.choice(away)), T
+    if kind == "right":
+        return id, T
     if kind == "moved":
-        way = rng.standard_normal(3)
-        return id, SE3(T.R, T.t + way / np.linalg.norm(way))
+        ways = rng.standard_normal((16, 3))
+        moved = [SE3(T.R, T.t + way / np.linalg.norm(way)) for way in ways]
+        return next(((id, T) for T in moved if walk.sight(t_ns, id, T) is not None), None)
     s = walk.sight(t_ns, id, T)
     assert s is not None
     T_world_cam = walk.truth(t_ns) @ walk.rig.cameras[0].T_body_cam
@@ -145,7 +156,8 @@ def wrongly_hung(walk: TaggedWalk, t_ns: int, kind: str, rng: np.random.Generato
 
 @dataclass(frozen=True)
 class Trial:
-    """kind; sights : of the wrong tag; used : of those in the window's solution; named : at which, 0 = not
+    """kind; sights : of the wrong tag; used : the first of them in the window's solution, named : the one at which it
+    was named; 0 = none
     lost : the window ended in the trial
     """
 
@@ -157,7 +169,8 @@ class Trial:
 
 
 def trials(walk: TaggedWalk, kinds: Sequence[str], every: int, rng: np.random.Generator) -> Iterator[Trial]:
-    """From every so many frames of a walk among surveyed tags on: three frames with a wrong one, on a copy."""
+    """From every so many frames of a walk among surveyed tags on: three frames with a wrong one, on a copy; or up to
+    SIGHTS, as long as it has neither been named nor had a say."""
     odometry = walk.odometry()
     odometry.tie(walk.known())
     held = list(walk.messages())
@@ -169,10 +182,10 @@ def trials(walk: TaggedWalk, kinds: Sequence[str], every: int, rng: np.random.Ge
         frames += 1
         if frames % every == 0 and odometry.window is not None and odometry._surveyed.tied:
             for kind in kinds:
-                trial = _trial(walk, odometry, held[i : i + 4 * 200 // int(walk.rate_hz)], kind, rng)
+                trial = _trial(walk, odometry, held[i : i + (SIGHTS + 1) * 200 // int(walk.rate_hz)], kind, rng)
                 if trial is not None:
                     yield trial
-        odometry.feed_frame(message, walk.look(message))
+        odometry.feed_frame(message, walk.look(message, apart))
 
 
 def _trial(
@@ -187,19 +200,20 @@ def _trial(
     told: list[str] = []
     copied.emit = lambda t_ns, kind, **fields: told.append(str(fields.get("tag", "")))
     copied._contradicted.pop(name, None)
+    copied._probation.tried.pop(name, None)
     for message in ahead:
         if not isinstance(message, Frame):
             copied.feed_imu(message)
             continue
-        true = [s for s in walk.look(message) if s.id != id]
+        true = [s for s in walk.look(message, apart) if s.id != id]
         sighting = walk.sight(message.t_ns, id, T_world_tag)
-        if sighting is None or seen == 3:
+        if sighting is None or seen == SIGHTS or (seen >= 3 and (named or used)):
             break
         copied.feed_frame(message, [*true, sighting])
         copied.flush()
         seen += 1
         if copied.window is None:
             return Trial(kind, seen, used, named, lost=True)
-        used += any(v.view.id == name and v.use for v in copied.window.frames[-1].tags)
+        used = used or seen * any(v.view.id == name and v.use for v in copied.window.frames[-1].tags)
         named = named or (seen if name in told else 0)
-    return Trial(kind, seen, used, named) if seen == 3 else None
+    return Trial(kind, seen, used, named) if seen >= 3 else None

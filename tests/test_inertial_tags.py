@@ -13,6 +13,7 @@ from lodelight.estimation.window import Window
 from lodelight.estimation.window_frames import moved_row
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp, so3_log
+from lodelight.odometry.probation import Probation
 from lodelight.odometry.tag_views import NewTags, tag_views
 from tag_flights import WRONG, TaggedWalk, trials
 
@@ -45,13 +46,16 @@ def test_a_walk_is_tied_to_the_world_by_tags_that_no_single_view_settles():
     assert np.degrees(np.linalg.norm(d[-5:, :3], axis=1).max()) < 0.2
 
 
-def test_no_wrong_tag_has_a_say_and_each_is_named_within_three_frames():
-    """`python benchmarks/wrong_tags.py` has a thousand; the true ones beside them go on counting."""
-    done = list(trials(TaggedWalk(3, 12.0, count=24), WRONG, 11, np.random.default_rng(0)))
+def test_a_tag_has_no_say_before_its_views_have_shown_that_it_hangs_right():
+    """`python benchmarks/wrong_tags.py` has a thousand. A turned one is named as soon as noise does not explain it."""
+    done = list(trials(TaggedWalk(3, 12.0, count=48), ("right", *WRONG), 20, np.random.default_rng(0)))
     kinds = Counter(trial.kind for trial in done)
-    assert len(done) >= 6
-    assert len(kinds) >= 3
-    assert [trial for trial in done if trial.used or trial.lost or not 1 <= trial.named <= 3] == []
+    assert len(kinds) == 5
+    right = [trial for trial in done if trial.kind == "right"]
+    assert [trial for trial in right if trial.used != 3 or trial.named] == []
+    wrong = [trial for trial in done if trial.kind != "right"]
+    assert [trial for trial in wrong if trial.used or trial.lost] == []
+    assert [trial for trial in wrong if trial.kind != "flipped" and not 1 <= trial.named <= 3] == []
 
 
 def test_both_copies_of_a_tag_seen_twice_in_one_image_are_left_out():
@@ -62,7 +66,14 @@ def test_both_copies_of_a_tag_seen_twice_in_one_image_are_left_out():
     s = walk.sight(t_ns, "1", T_world_cam @ SE3(np.eye(3), np.array([0.0, 0.1, 1.5])))
     assert s is not None
     for shown, count in (([s], 1), ([s, replace(s, corners_px=s.corners_px + 60.0)], 0)):
-        views, _ = tag_views(window, shown, T_world_cam, lambda name: None, lambda s, T: T @ SE3.identity())
+        views, _ = tag_views(
+            window,
+            shown,
+            T_world_cam,
+            lambda name: None,
+            lambda s, T: T @ SE3.identity(),
+            Probation(walk.rig.cameras[0].camera),
+        )
         assert len(views) == count
 
 

@@ -20,7 +20,7 @@ from lodelight.estimation.window_build import build, store
 from lodelight.estimation.window_frames import Seen, SeenTag, WindowFrame, moved_row, pose_of, pose_row, row_of
 from lodelight.estimation.window_leave import forget_tags, marginalize_oldest
 from lodelight.estimation.window_problem import CONVERGED_CHI2, SETTLED_CHI2, Belief, Problem
-from lodelight.estimation.window_tags import TagStates
+from lodelight.estimation.window_tags import TagStates, inverse
 from lodelight.estimation.window_types import (
     Departed,
     Landmarks,
@@ -162,6 +162,24 @@ class Window:
         """Whether a tag was declared."""
         return tag in self.tag_states.number
 
+    def is_known(self, tag: str) -> bool:
+        """Whether a sighting of it can contradict something: it was surveyed, or has been seen."""
+        return self.knows(tag) and self.tag_states.is_known(tag)
+
+    def admit(self, tag: str) -> None:
+        """Its sightings that were held, and agreed, count from the next solve on."""
+        for frame in self.frames:
+            for seen in frame.tags:
+                seen.use |= seen.view.id == tag and seen.tested and seen.agrees
+
+    def tag(self, tag: str) -> tuple[SE3, Array]:
+        """Where a tag is believed, with the covariance in the chart of SE3.perturbed; it must be known."""
+        state = self.tag_states.states[self.tag_states.number[tag]]
+        estimated = self.tags().get(tag) if state.lin is not None else None
+        if estimated is not None:
+            return estimated
+        return pose_of(state.row), np.zeros((6, 6)) if state.belief is None else inverse(state.belief.information)
+
     def forget(self, tracks: Iterable[int]) -> None:
         """These tracks are wrong: nothing of them is used any more."""
         gone = np.fromiter(tracks, np.int64)
@@ -203,7 +221,7 @@ class Window:
             np.unique(track[seen_now & rejected]),
             problem.linear.imu_chi2 / max(15 * int(problem.use_imu.sum()), 1),
             {s.view.id: s.chi2 for s in newest.tags},
-            tuple(s.view.id for s in newest.tags if not s.use),
+            tuple(s.view.id for s in newest.tags if not s.agrees),
         )  # fmt: skip
         if newest.keyframe and sum(f.keyframe for f in self.frames) > self.config.keyframes:
             self.covariance()

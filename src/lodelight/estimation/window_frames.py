@@ -69,10 +69,11 @@ class Seen:
 
 @dataclass(eq=False)
 class SeenTag:
-    """use False : it contradicted the window"""
+    """use : it counts; agrees False : it contradicted the window"""
 
     view: TagView
     use: bool = True
+    agrees: bool = True
     tested: bool = False
     chi2: float = 0.0
 

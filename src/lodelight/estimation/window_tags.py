@@ -80,7 +80,8 @@ class TagStates:
         for seen in doubtful:
             seen.chi2 = self._innovation(problem, seen.view, config)
             seen.tested = True
-            seen.use = seen.view.trusted or seen.chi2 <= config.tag_gate_chi2
+            seen.agrees = seen.view.trusted or seen.chi2 <= config.tag_gate_chi2
+            seen.use = seen.agrees and not seen.view.held
 
     def _innovation(self, problem: Problem, view: TagView, config: WindowConfig) -> float:
         """Chi-square, of 8 degrees of freedom, of what the window expects of these corners; inf where it cannot see

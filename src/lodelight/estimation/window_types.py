@@ -120,6 +120,7 @@ class TagView:
 
     T_cam_tag : of the sighting alone; where to start a tag of which nothing is known
     trusted : not to be tested against the window (what follows a relocalization by this very tag)
+    held : tested, but without a say until the window is told to admit its tag
     """
 
     id: str
@@ -129,6 +130,7 @@ class TagView:
     T_cam_tag: SE3 | None = None
     dt_s: float = 0.0
     trusted: bool = False
+    held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,7 @@ class Solution:
     imu_chi2 : of the IMU between the frames, per degree of freedom: 1 or less where it agrees with the images
     tag_chi2 : by id, of 8 degrees of freedom, of the newest frame's sightings: against the window before them where it
         was tested, else at the result
-    tag_rejected : ids of those that were left out
+    tag_rejected : ids of those that contradicted it, and were left out
     """
 
     ok: bool

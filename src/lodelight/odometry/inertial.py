@@ -22,6 +22,7 @@ from lodelight.imu.stream import ImuStream
 from lodelight.imu.vibration import Vibration
 from lodelight.messages import Frame, Imu, Status, TagSighting
 from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
+from lodelight.odometry.probation import Probation
 from lodelight.odometry.surveyed import SurveyedTags
 from lodelight.odometry.tag_views import NewTags, tag_views
 from lodelight.rig import Rig
@@ -109,6 +110,7 @@ class InertialOdometry:
         self._contradicted: dict[str, int] = {}  # frames in a row in which a tag did
         self._surveyed = SurveyedTags()
         self._new_tags = NewTags(rig.cameras[0].camera)
+        self._probation = Probation(rig.cameras[0].camera)
         self._last_ns: int | None = None
         self._keyframe: LastKeyframe | None = None
         self._blind_since: int | None = None
@@ -165,12 +167,15 @@ class InertialOdometry:
         R_now_last = self.R_body_cam.T @ predicted.T_world_body.R.T @ window.newest.T_world_body.R @ self.R_body_cam
         tracks = self.tracker.process(frame, R_now_last, sigma_rotation=2e-3)
         T_map_cam = predicted.T_world_body @ self.rig.cameras[0].T_body_cam
-        views, new = tag_views(window, tags, T_map_cam, self._surveyed.declaration, self._new_tags.place)
+        views, new = tag_views(
+            window, tags, T_map_cam, self._surveyed.declaration, self._new_tags.place, self._probation
+        )  # fmt: skip
         reason = self._keyframe_reason(tracks, predicted.T_world_body)
         reason = reason or (f"first sight of {new[0]}" if new else "")
         window.add_frame(frame.t_ns, imu, self._observations(tracks), views, bool(reason), self._still(imu))
         solution = window.solve()
-        self._name_wrong_tags(frame.t_ns, solution)
+        used = {seen.view.id for seen in window.frames[-1].tags if seen.use}
+        self._judge_tags(tags, solution)
         state = window.newest
         inliers = len(tracks) - len(solution.outliers)
         failure = self._failure(solution, state) or self._blind(inliers, frame.t_ns)
@@ -182,7 +187,6 @@ class InertialOdometry:
         blind = self._blind_since is not None
         why = f"{inliers} tracks agree, fewer than {self.config.few_tracks}: the IMU carries the pose" if blind else ""
         self.stream.forget_before(frame.t_ns)
-        used = {view.id for view in views} - set(solution.tag_rejected)
         return OdometryStep(
             frame, "degraded" if blind else "tracking", state, window.covariance(), tracks, inliers, reason, why,
             tied=self._surveyed.tied and not used.isdisjoint(self._surveyed.known),
@@ -194,24 +198,41 @@ class InertialOdometry:
         if self.window is None:
             return None
         T_map_cam = None if T_map_body is None else T_map_body @ self.rig.cameras[0].T_body_cam
-        moved = self._surveyed.lay_down(
+        laid = self._surveyed.lay_down(
             self.window, tags, lambda s: None if T_map_cam is None else self._new_tags.place(s, T_map_cam)
         )  # fmt: skip
-        if moved is not None:
-            self._new_tags.move(moved)
-            if self._keyframe is not None:
-                self._keyframe = replace(self._keyframe, T_map_body=moved @ self._keyframe.T_map_body)
+        if laid is None:
+            return None
+        moved, name = laid
+        self._new_tags.move(moved)
+        self._probation.move(moved)
+        self._probation.admit(name, self.window.newest.t_ns)
+        if self._keyframe is not None:
+            self._keyframe = replace(self._keyframe, T_map_body=moved @ self._keyframe.T_map_body)
         return moved
 
-    def _name_wrong_tags(self, t_ns: int, solution: Solution) -> None:
-        """Tags that the window left out twice in a row; one that hangs right may miss the test once in a hundred."""
-        for name, chi2 in solution.tag_chi2.items():
-            rejected = name in solution.tag_rejected
-            count = self._contradicted.get(name, 0) + 1 if rejected else 0
-            self._contradicted[name] = count
-            if count == 2:
-                why = f"its corners contradict the window's (chi-square {chi2:.0f}); it is not used there"
-                self.emit(t_ns, "tag", tag=name, verdict="contradicts", why=why)
+    def _judge_tags(self, tags: Sequence[TagSighting], solution: Solution) -> None:
+        """Admit tags whose views have shown where they hang; name those that the window left out twice in a row, as
+        one that hangs right may miss the test once in a hundred, and those that hang otherwise."""
+        assert self.window is not None
+        window = self.window
+        for s in tags:
+            name, chi2 = s.name, solution.tag_chi2.get(s.name)
+            if chi2 is None:
+                continue
+            if name in solution.tag_rejected:
+                self._contradicted[name] = self._contradicted.get(name, 0) + 1
+                self._probation.contradicted(name)
+                if self._contradicted[name] == 2:
+                    self._name(s, f"its corners contradict the window's (chi-square {chi2:.0f}); it is not used there")
+                continue
+            self._contradicted[name] = 0
+            found = self._probation.agreed(s, window, self.rig.cameras[0].T_body_cam)
+            if found:
+                self._name(s, found)
+
+    def _name(self, s: TagSighting, why: str) -> None:
+        self.emit(s.t_ns, "tag", tag=s.name, verdict="contradicts", why=why)
 
     def _imu_since_last(self, t_ns: int) -> tuple[ImuSamples | None, str]:
         if self._last_ns is None:
@@ -302,6 +323,7 @@ class InertialOdometry:
         self.emit(window.newest.t_ns, "start", how=start.how, why=start.why)
         self.window, self._blind_since, self._surveyed.tied = window, None, False
         self._new_tags.seen.clear()
+        self._probation.tried.clear()
         self.starter.reset()
         self._views = []
         return window

@@ -18,6 +18,10 @@ from lodelight.estimation.window import Tag, Window
 from lodelight.geometry.se3 import SE3, level
 from lodelight.messages import TagSighting
 from lodelight.tags.gate import KnownTag
+from lodelight.types import Array
+
+AGREE_CHI2 = 22.46  # 99.9 % of six degrees of freedom
+OFF_RAD, OFF_M = 0.01, 0.05  # between two tags, beyond the covariances
 
 
 @dataclass(eq=False)
@@ -42,38 +46,57 @@ class SurveyedTags:
     def lay_down(
         self, window: Window, sightings: Sequence[TagSighting] = (),
         placed: Callable[[TagSighting], SE3 | None] = lambda sighting: None,
-    ) -> SE3 | None:  # fmt: skip
-        """T_map_old by which the window was moved among the tags; None where it lies there, or none is in it yet.
+    ) -> tuple[SE3, str] | None:  # fmt: skip
+        """T_map_old by which the window was moved among the tags, and by which of them; None where it lies there, or
+        none is in it yet.
 
         sightings : in the frame to come; placed : where such a tag is in the old frame, if that is clear
         """
         if self.tied:
             return None
-        T_map_old = self._by_estimates(window) or self._by_sighting(sightings, placed)
-        if T_map_old is not None:
-            window.align(T_map_old, release_gauge=True)
-            self.tied = True
-            self._declare(window, set(self.known))
-        return T_map_old
-
-    def _by_estimates(self, window: Window) -> SE3 | None:
-        """By the tag that the window knows best."""
-        if not any(window.knows(name) for name in self.known):
+        found = {name: at for name, at in window.tags().items() if name in self.known} if self._any(window) else {}
+        by = self._best(found) or self._by_sighting(sightings, placed)
+        if by is None:
             return None
-        found = {name: at for name, at in window.tags().items() if name in self.known}
-        if not found:
-            return None
-        name = min(found, key=lambda name: float(np.trace(found[name][1])))
-        T_old_tag = found[name][0]
-        return level(_place(self.known[name]) @ T_old_tag.inverse(), T_old_tag.t)
+        name, T_old_tag = by
+        T_map_old = level(_place(self.known[name]) @ T_old_tag.inverse(), T_old_tag.t)
+        agreeing = {other for other in self.known if other not in found or self._agree(name, other, found)}
+        window.align(T_map_old, release_gauge=True)
+        self.tied = True
+        self._declare(window, agreeing)
+        return T_map_old, name
 
-    def _by_sighting(self, sightings: Sequence[TagSighting], placed: Callable[[TagSighting], SE3 | None]) -> SE3 | None:
-        """By the largest tag of which it is clear how it hangs."""
+    def _any(self, window: Window) -> bool:
+        return any(window.knows(name) for name in self.known)
+
+    @staticmethod
+    def _best(found: Mapping[str, tuple[SE3, Array]]) -> tuple[str, SE3] | None:
+        """The tag that the window knows best."""
+        name = min(found, key=lambda name: float(np.trace(found[name][1])), default=None)
+        return None if name is None else (name, found[name][0])
+
+    def _by_sighting(
+        self, sightings: Sequence[TagSighting], placed: Callable[[TagSighting], SE3 | None]
+    ) -> tuple[str, SE3] | None:
+        """The largest tag of which it is clear how it hangs."""
         for s in sorted(sightings, key=lambda s: -s.side_px):
             T_old_tag = placed(s) if s.name in self.known else None
             if T_old_tag is not None:
-                return level(_place(self.known[s.name]) @ T_old_tag.inverse(), T_old_tag.t)
+                return s.name, T_old_tag
         return None
+
+    def _agree(self, a: str, b: str, found: Mapping[str, tuple[SE3, Array]]) -> bool:
+        """Whether two tags hang to each other in the window as their surveys say: else only `a` is believed."""
+        if a == b or a not in found:
+            return True
+        (T_a, P_a), (T_b, P_b) = found[a], found[b]
+        there = T_a.inverse() @ T_b
+        surveyed = _place(self.known[a]).inverse() @ _place(self.known[b])
+        d = np.concatenate([(surveyed.inverse() @ there).log()[:3], there.t - surveyed.t])
+        S = P_a + P_b + self.known[a].covariance + self.known[b].covariance
+        swing = float(np.trace(P_a[:3, :3] + self.known[a].covariance[:3, :3])) * float(there.t @ there.t)
+        S = np.diag(np.diag(S)) + np.diag([OFF_RAD**2] * 3 + [OFF_M**2 + swing] * 3)
+        return float(d @ np.linalg.solve(S, d)) <= AGREE_CHI2
 
     def _declare(self, window: Window, names: set[str]) -> None:
         """Tell of surveys to a window that has these tags already; of others it is told at their first sight."""

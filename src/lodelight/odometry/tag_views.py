@@ -18,24 +18,24 @@ from lodelight.estimation.window import Tag, TagView, Window
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.messages import TagSighting
+from lodelight.odometry.probation import Probation, extended
 from lodelight.tags.gate import GateConfig
 from lodelight.tags.pose import by_gravity, clear, tag_poses
 from lodelight.tags.survey import MappedTag, map_tag
 from lodelight.tags.survey import TagView as View
 
-APART_M, APART_DEG = 0.05, 3.0  # views nearer to each other say the same twice
-MOST_VIEWS, OLD_S = 8, 10.0  # of a tag that are remembered: the odometry's frame drifts
+OLD_S = 10.0  # the odometry's frame drifts, and what was seen before this says no more
 
 
 def tag_views(
     window: Window, sightings: Sequence[TagSighting], T_map_cam: SE3, surveyed: Callable[[str], Tag | None],
-    placed: Callable[[TagSighting, SE3], SE3 | None],
+    placed: Callable[[TagSighting, SE3], SE3 | None], probation: Probation,
 ) -> tuple[list[TagView], list[str]]:  # fmt: skip
     """What a frame says of tags, and the names of those that the window has not had yet, which are declared to it.
 
     surveyed : a tag by name where its place is known; placed : T_map_tag of another one, as soon as that is clear, by
     its sighting and T_map_cam. Left out are sightings without a size, both copies of a tag that is seen twice, and what
-    has no place yet.
+    has no place yet. Held, without a say, are those of known tags on probation.
     """
     copies = Counter(s.name for s in sightings)
     views, new = [], []
@@ -51,10 +51,12 @@ def tag_views(
                     continue
                 T_cam_tag = T_map_cam.inverse() @ T_map_tag
                 tag = Tag(s.name, np.asarray(tag_corners(s.size_m), np.float64))
+                probation.admit(s.name, s.t_ns)
             window.declare(tag)
             new.append(s.name)
         sigma_px = np.hypot(s.sigma_px, GateConfig.model_px)
-        views.append(TagView(s.name, s.camera, s.corners_px, sigma_px, T_cam_tag))
+        held = probation.holds(s.name, s.t_ns)
+        views.append(TagView(s.name, s.camera, s.corners_px, sigma_px, T_cam_tag, held=held))
     return views, new
 
 
@@ -74,9 +76,9 @@ class NewTags:
         if settled is not None:
             return T_map_cam @ settled.T_cam_tag
         views = [v for v in self.seen.get(s.name, ()) if (s.t_ns - v.sighting.t_ns) * 1e-9 < OLD_S]
-        if views and not (views[-1].T_world_cam.inverse() @ T_map_cam).exceeds(APART_M, APART_DEG):
+        if not extended(views, s, T_map_cam):
             return None
-        views = self.seen[s.name] = [*views, View(s, T_map_cam)][-MOST_VIEWS:]
+        self.seen[s.name] = views
         found = map_tag(views, s.size_m, self.camera)
         return found.T_world_tag if isinstance(found, MappedTag) else None
 
