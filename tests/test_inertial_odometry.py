@@ -163,15 +163,42 @@ def length_ratio(steps: list[OdometryStep], motion: Motion) -> float:
     return float(lengths[0] / lengths[1])
 
 
-def test_a_tag_of_known_size_is_a_keyframe_at_first_sight_and_keeps_the_scale():
-    """The IMU is ten times as noisy as a good one."""
+def test_one_camera_starts_in_flight_within_the_first_frames_that_show_a_tag_of_known_size():
+    motion = flight(2.0, seed=1)
+    steps, odometry, events = run(motion, 1, look=with_tag(motion))
+    started = next(s for s in steps if s.status == "tracking")
+    assert seconds(started) <= 0.25
+    assert next(f["how"] for _, kind, f in events if kind == "start") == "in motion"
+    true = motion.at_ns(np.array([started.frame.t_ns]))
+    v_body = started.state.T_world_body.R.T @ started.state.v_world
+    assert np.linalg.norm(v_body - true.R_world_body[0].T @ true.v_world[0]) < 0.05
+    up = started.state.T_world_body.R.T @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arccos(up @ true.R_world_body[0].T @ [0.0, 0.0, 1.0])) < 2.0
+    assert odometry.restarts == 0
+    assert abs(length_ratio(steps, motion) - 1.0) < 0.01
+
+
+def test_a_tag_keeps_the_scale_where_the_imu_is_ten_times_as_noisy():
     motion = flight(4.0, seed=6)
     spec = ImuSpec(gyro_noise=1.7e-3, accel_noise=2e-2)
     steps, odometry, _ = run(motion, 1, spec=spec, look=with_tag(motion))
-    assert any(s.keyframe == "first sight of tag36h11 3" for s in steps)
     assert odometry.window is not None
     assert odometry.window.knows("tag36h11 3")
     assert abs(length_ratio(steps, motion) - 1.0) < 0.01
+
+
+@pytest.mark.parametrize(("cameras", "says", "within_s"), [(1, 1.5, 2.5), (2, 0.8, 0.5)])
+def test_a_tag_of_another_size_than_it_says_is_named_by_how_much(cameras, says, within_s):
+    motion = flight(2.5, seed=0)
+    shown = with_tag(motion)
+    steps, _, events = run(
+        motion, cameras, look=lambda f: [dataclasses.replace(s, size_m=says * SIZE_M) for s in shown(f)]
+    )
+    t_ns, fields = next((t, f) for t, kind, f in events if kind == "tag" and "measures" in f["why"])
+    assert (t_ns - START_NS) * 1e-9 <= within_s
+    measured = float(fields["why"].split("measures ")[1].split(" m")[0])
+    assert abs(measured / SIZE_M - 1.0) < 0.06
+    assert abs(length_ratio(steps, motion) - 1.0) < 0.05
 
 
 def test_a_tag_that_is_moved_is_named_within_three_frames_and_has_no_say():

@@ -14,7 +14,7 @@ from lodelight.estimation.window_frames import moved_row
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp, so3_log
 from lodelight.odometry.probation import Probation
-from lodelight.odometry.tag_views import NewTags, tag_views
+from lodelight.odometry.tag_views import tag_views
 from tag_flights import WRONG, TaggedWalk, trials
 
 YAWED = SE3.exp(np.array([0.0, 0.0, 0.7, 3.0, -1.0, 0.2]))
@@ -22,7 +22,7 @@ YAWED = SE3.exp(np.array([0.0, 0.0, 0.7, 3.0, -1.0, 0.2]))
 
 def test_a_walk_is_tied_to_the_world_by_tags_that_no_single_view_settles():
     """A level camera before upright tags: gravity does not tell which way they are turned, three views do."""
-    walk = TaggedWalk(0, 14.6)
+    walk = TaggedWalk(0, 15.2)
     odometry = walk.odometry()
     odometry.tie(walk.known())
     steps = [step for step in walk.steps(odometry) if step.status == "tracking"]
@@ -48,7 +48,7 @@ def test_a_walk_is_tied_to_the_world_by_tags_that_no_single_view_settles():
 
 def test_a_tag_has_no_say_before_its_views_have_shown_that_it_hangs_right():
     """`python benchmarks/wrong_tags.py` has a thousand. A turned one is named as soon as noise does not explain it."""
-    done = list(trials(TaggedWalk(3, 12.0, count=48), ("right", *WRONG), 20, np.random.default_rng(0)))
+    done = list(trials(TaggedWalk(3, 12.0, count=48), ("right", *WRONG), 25, np.random.default_rng(0)))
     kinds = Counter(trial.kind for trial in done)
     assert len(kinds) == 5
     right = [trial for trial in done if trial.kind == "right"]
@@ -72,31 +72,9 @@ def test_both_copies_of_a_tag_seen_twice_in_one_image_are_left_out():
             T_world_cam,
             lambda name: None,
             lambda s, T: T @ SE3.identity(),
-            Probation(walk.rig.cameras[0].camera),
+            Probation(walk.rig.cameras[0]),
         )
         assert len(views) == count
-
-
-def test_views_of_a_new_tag_move_with_the_frame():
-    walk = TaggedWalk(0, 8.0)
-    spec = walk.rig.cameras[0]
-    here, moved = NewTags(spec.camera), NewTags(spec.camera)
-    found = there = None
-    frames = [m.t_ns for m in walk.messages() if not hasattr(m, "gyro")]
-    for t_ns in frames[::3]:
-        s = walk.sight(t_ns, "1", walk.hung["1"])
-        if s is None or found is not None:
-            continue
-        T = walk.truth(t_ns) @ spec.T_body_cam
-        if len(moved.seen.get(s.name, ())) == 2:
-            moved.move(YAWED)
-        found = here.place(s, T)
-        after = len(moved.seen.get(s.name, ())) >= 2
-        there = moved.place(s, YAWED @ T if after else T)
-    assert found is not None
-    assert there is not None
-    assert np.linalg.norm((found.inverse() @ walk.hung["1"]).t) < 0.15
-    np.testing.assert_allclose(there.t, (YAWED @ found).t, atol=1e-3)
 
 
 # -- the prior --------------------------------------------------------------------------------------------------------

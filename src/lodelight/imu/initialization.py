@@ -33,7 +33,8 @@ ALIGNED_VIEWS = 12
 @dataclass(frozen=True)
 class StartConfig:
     """rest_s : standing still for so long starts; longest_s : of images that are kept
-    shortest_s : in motion, with one camera; shortest_metric_s : with two, or depth
+    shortest_s : in motion, with one camera; shortest_metric_s : with two, or depth; shortest_tag_s : with a tag of
+        known size in view
     rest_px, rest_gyro, rest_accel : standing still moves the image by no more (median), and deviates by no more,
         rad/s and m/s^2; a drone's motors may run
     min_tracks : landmarks seen from the first to the last image
@@ -48,6 +49,7 @@ class StartConfig:
     rest_s: float = 0.4
     shortest_s: float = 1.4
     shortest_metric_s: float = 0.7
+    shortest_tag_s: float = 0.1
     longest_s: float = 1.9
     rest_px: float = 0.75
     rest_gyro: float = 0.1
@@ -69,6 +71,7 @@ class StartView:
 
     track (N,), camera (N,); ray (N, 3) unit, in that camera; inv_depth, sigma_inv_depth (N,) 1/m, 0 = none
     R_now_last : (3, 3) turn of camera 0 since the image before, by the images alone
+    tags : names of those of known size whose centres are among the rows, their distance as inverse depth
     """
 
     t_ns: int
@@ -78,6 +81,7 @@ class StartView:
     inv_depth: Array
     sigma_inv_depth: Array
     R_now_last: Array
+    tags: tuple[str, ...] = ()
 
     def first_camera(self) -> tuple[NDArray[np.int64], Array]:
         """Tracks and rays of camera 0."""
@@ -92,6 +96,7 @@ class Started:
 
     how : "at rest" or "in motion"; why : in words, with figures
     sigma_tilt rad, sigma_velocity m/s, sigma_bias_gyro rad/s, sigma_bias_accel m/s^2 : of the first state
+    sigma_scale : of how far the body went, as a share; tags : that were in view
     """
 
     how: str
@@ -101,6 +106,8 @@ class Started:
     sigma_velocity: float
     sigma_bias_gyro: float
     sigma_bias_accel: float
+    sigma_scale: float = 0.0
+    tags: tuple[str, ...] = ()
 
 
 class Starter:
@@ -121,6 +128,10 @@ class Starter:
     def reset(self) -> None:
         self.views, self.imu = [], []
 
+    def anew(self) -> Starter:
+        """Another one, that has seen nothing."""
+        return Starter(self.spec, self.T_body_cam, self.focal_px, self.metric, self.config)
+
     def add(self, view: StartView, imu: ImuSamples | None) -> None:
         """The next image, and the samples since the one before; without them (None) all before is forgotten."""
         if imu is None:
@@ -132,14 +143,19 @@ class Starter:
             del self.views[0], self.imu[0]
 
     @property
+    def _tags(self) -> tuple[str, ...]:
+        """Of known size, in the newest image and the one before it."""
+        return tuple(name for name in self.views[-1].tags if name in self.views[-2].tags) if len(self.views) > 1 else ()
+
+    @property
     def _span_s(self) -> float:
         return (self.views[-1].t_ns - self.views[0].t_ns) * 1e-9 if self.views else 0.0
 
     def find(self) -> Started | str:
         """The start, or what is missing. Raises SourceError where the IMU's units are wrong."""
         c = self.config
-        shortest_s = c.shortest_metric_s if self.metric else c.shortest_s
-        if len(self.views) < 3 or self._span_s < c.rest_s:
+        shortest_s = c.shortest_tag_s if self._tags else c.shortest_metric_s if self.metric else c.shortest_s
+        if len(self.views) < 3 or self._span_s < min(c.rest_s, shortest_s) - 1e-6:
             return (
                 f"{self._span_s:.2f} s of images and IMU so far; {c.rest_s:.2f} s are needed standing still, "
                 f"{shortest_s:.2f} s in motion"
@@ -147,10 +163,10 @@ class Starter:
         fault = accelerometer_fault(np.vstack([s.accel for s in self.imu])) or self._gyro_fault()
         if fault:
             raise SourceError(fault)
-        at_rest = self._at_rest()
+        at_rest = self._at_rest() if self._span_s >= c.rest_s else f"standing still {c.rest_s:.2f} s are needed"
         if isinstance(at_rest, Started):
             return at_rest
-        if self._span_s < shortest_s:
+        if self._span_s < shortest_s - 1e-6:
             return f"{at_rest}; in motion {shortest_s:.2f} s are needed, there are {self._span_s:.2f}"
         in_motion = self._in_motion()
         return in_motion if isinstance(in_motion, Started) else f"{at_rest}; {in_motion}"
@@ -208,7 +224,7 @@ class Starter:
             return f"{lasting} tracks last for {self._span_s:.1f} s, {c.min_tracks} are needed"
         bias = self._gyro_bias()
         motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
-        if not self.metric:
+        if not (self.metric or self._tags):
             parallax = self._parallax_deg(motions)
             if parallax < c.min_parallax_deg:
                 return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
@@ -219,10 +235,15 @@ class Starter:
         if isinstance(found, str):
             return found
         missing = self._missing(found, motions)
-        return missing or self._started(found)
+        return missing or self._started(found, motions)
+
+    @staticmethod
+    def _sigma_scale(found: Alignment, motions: list[Preintegration]) -> float:
+        return math.hypot(found.sigma_scale, _drift(found, motions))
 
     def _rows(self) -> Rows:
-        """Sightings in the chosen images of the tracks that have four of them or more, sorted by track."""
+        """Sightings in the chosen images of the tracks that have four of them or more, three of few images and two of
+        a tag's centre, sorted by track."""
         views = [self.views[i] for i in self._chosen]
         track = np.concatenate([v.track for v in views])
         frame = np.repeat(np.arange(len(views)), [len(v.track) for v in views])
@@ -231,7 +252,7 @@ class Starter:
             for name in ("camera", "ray", "inv_depth", "sigma_inv_depth")
         )
         _, which, count = np.unique(track, return_inverse=True, return_counts=True)
-        kept = np.flatnonzero(count[which] >= 4)
+        kept = np.flatnonzero((count[which] >= min(4, len(views))) | ((track < 0) & (count[which] >= 2)))
         order = kept[np.lexsort((camera[kept], frame[kept], track[kept]))]
         _, landmark = np.unique(track[order], return_inverse=True)
         return Rows(
@@ -311,7 +332,7 @@ class Starter:
             )
         shares = [
             (
-                0.0 if self.metric else math.hypot(found.sigma_scale, _drift(found, motions)),
+                0.0 if self.metric or self._tags else self._sigma_scale(found, motions),
                 c.max_scale,
                 "scale known to {:.0%}, {:.0%} are needed: accelerate",
             ),
@@ -333,7 +354,7 @@ class Starter:
                 "+9.81 m/s^2 upwards); negate it in the recording"
             )
 
-    def _started(self, found: Alignment) -> Started:
+    def _started(self, found: Alignment, motions: list[Preintegration]) -> Started:
         R0 = upright(found.gravity)
         states = [
             NavState(self.views[i].t_ns, SE3(R0 @ R, R0 @ p), R0 @ v, found.bias_gyro, found.bias_accel)
@@ -342,11 +363,11 @@ class Starter:
         why = (
             f"in motion: {self._span_s:.2f} s of images, {found.path_m:.2f} m, scale known to {found.sigma_scale:.1%}, "
             f"gravity to {math.degrees(found.sigma_tilt):.2f} deg"
-        )
+        ) + (f", with {', '.join(self._tags)} in view" if self._tags else "")
         sigma = np.sqrt(np.diag(found.covariance))
         return Started(
             "in motion", why, states, found.sigma_tilt, float(sigma[2:5].max()), float(sigma[5:8].max()),
-            float(sigma[8:].max()),
+            float(sigma[8:].max()), self._sigma_scale(found, motions), self._tags,
         )  # fmt: skip
 
 

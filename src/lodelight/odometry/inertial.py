@@ -24,6 +24,7 @@ from lodelight.messages import Frame, Imu, Status, TagSighting
 from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
 from lodelight.odometry.probation import Probation
 from lodelight.odometry.surveyed import SurveyedTags
+from lodelight.odometry.tag_start import ScaleCheck, TagStart
 from lodelight.odometry.tag_views import NewTags, tag_views
 from lodelight.rig import Rig
 from lodelight.tags.gate import KnownTag
@@ -109,13 +110,15 @@ class InertialOdometry:
         self._pending: tuple[Frame, Sequence[TagSighting]] | None = None
         self._contradicted: dict[str, int] = {}  # frames in a row in which a tag did
         self._surveyed = SurveyedTags()
-        self._new_tags = NewTags(rig.cameras[0].camera)
-        self._probation = Probation(rig.cameras[0].camera)
+        self._new_tags = NewTags(rig.cameras[0])
+        self._probation = Probation(rig.cameras[0])
         self._last_ns: int | None = None
         self._keyframe: LastKeyframe | None = None
         self._blind_since: int | None = None
         self._left_at: NavState | None = None  # where the last window was left
-        self._views: list[Tracks] = []  # of the starter's images
+        self._views: list[tuple[Tracks, Sequence[TagSighting]]] = []  # of the starter's images
+        self._tag_start = TagStart(rig.cameras[0])
+        self._check: ScaleCheck | None = None
 
     # -- messages -----------------------------------------------------------------------------------------------
 
@@ -157,7 +160,7 @@ class InertialOdometry:
         imu, missing = self._imu_since_last(frame.t_ns)
         self._last_ns = frame.t_ns
         if self.window is None:
-            return self._try_start(frame, imu, missing)
+            return self._try_start(frame, imu, missing, tags)
         if imu is None:
             return self._fail(frame, missing)
         window = self.window
@@ -168,7 +171,7 @@ class InertialOdometry:
         tracks = self.tracker.process(frame, R_now_last, sigma_rotation=2e-3)
         T_map_cam = predicted.T_world_body @ self.rig.cameras[0].T_body_cam
         views, new = tag_views(
-            window, tags, T_map_cam, self._surveyed.declaration, self._new_tags.place, self._probation
+            window, tags, T_map_cam, self._surveyed.declaration, self._place, self._probation
         )  # fmt: skip
         reason = self._keyframe_reason(tracks, predicted.T_world_body)
         reason = reason or (f"first sight of {new[0]}" if new else "")
@@ -179,6 +182,7 @@ class InertialOdometry:
         state = window.newest
         inliers = len(tracks) - len(solution.outliers)
         failure = self._failure(solution, state) or self._blind(inliers, frame.t_ns)
+        failure = failure or self._wrong_scale(tracks, imu, state.T_world_body)
         if failure:
             return self._fail(frame, failure)
         self.tracker.drop(solution.outliers)
@@ -195,44 +199,47 @@ class InertialOdometry:
     def _lay_down(self, tags: Sequence[TagSighting] = (), T_map_body: SE3 | None = None) -> SE3 | None:
         """Move the window among the surveyed tags, if it does not lie there yet and one is known, or is in sight from
         about T_map_body."""
-        if self.window is None:
+        window = self.window
+        if window is None:
             return None
         T_map_cam = None if T_map_body is None else T_map_body @ self.rig.cameras[0].T_body_cam
         laid = self._surveyed.lay_down(
-            self.window, tags, lambda s: None if T_map_cam is None else self._new_tags.place(s, T_map_cam)
+            window, tags, lambda s: None if T_map_cam is None else self._place(s, T_map_cam)
         )  # fmt: skip
         if laid is None:
             return None
         moved, name = laid
-        self._new_tags.move(moved)
-        self._probation.move(moved)
-        self._probation.admit(name, self.window.newest.t_ns)
+        self._probation.admit(name, window.newest.t_ns)
+        if self._check is not None:
+            self._check.move(moved)
         if self._keyframe is not None:
             self._keyframe = replace(self._keyframe, T_map_body=moved @ self._keyframe.T_map_body)
         return moved
+
+    def _place(self, s: TagSighting, T_map_cam: SE3) -> SE3 | None:
+        assert self.window is not None
+        return self._new_tags.place(s, T_map_cam, self.window)
 
     def _judge_tags(self, tags: Sequence[TagSighting], solution: Solution) -> None:
         """Admit tags whose views have shown where they hang; name those that the window left out twice in a row, as
         one that hangs right may miss the test once in a hundred, and those that hang otherwise."""
         assert self.window is not None
-        window = self.window
+        for name, t_ns, why in self._new_tags.wrong():
+            self._name(name, t_ns, why)
         for s in tags:
-            name, chi2 = s.name, solution.tag_chi2.get(s.name)
+            chi2 = solution.tag_chi2.get(s.name)
             if chi2 is None:
                 continue
-            if name in solution.tag_rejected:
-                self._contradicted[name] = self._contradicted.get(name, 0) + 1
-                self._probation.contradicted(name)
-                if self._contradicted[name] == 2:
-                    self._name(s, f"its corners contradict the window's (chi-square {chi2:.0f}); it is not used there")
-                continue
-            self._contradicted[name] = 0
-            found = self._probation.agreed(s, window, self.rig.cameras[0].T_body_cam)
-            if found:
-                self._name(s, found)
+            rejected = s.name in solution.tag_rejected
+            self._contradicted[s.name] = self._contradicted.get(s.name, 0) + 1 if rejected else 0
+            why = self._probation.judge(s, self.window, rejected)
+            if not why and self._contradicted[s.name] == 2 and not self._probation.named(s.name):
+                why = f"its corners contradict the window's (chi-square {chi2:.0f}); it is not used there"
+            if why:
+                self._name(s.name, s.t_ns, why)
 
-    def _name(self, s: TagSighting, why: str) -> None:
-        self.emit(s.t_ns, "tag", tag=s.name, verdict="contradicts", why=why)
+    def _name(self, tag: str, t_ns: int, why: str) -> None:
+        self.emit(t_ns, "tag", tag=tag, verdict="contradicts", why=why)
 
     def _imu_since_last(self, t_ns: int) -> tuple[ImuSamples | None, str]:
         if self._last_ns is None:
@@ -276,10 +283,12 @@ class InertialOdometry:
 
     # -- start, failure -----------------------------------------------------------------------------------------
 
-    def _try_start(self, frame: Frame, imu: ImuSamples | None, missing: str) -> OdometryStep:
+    def _try_start(
+        self, frame: Frame, imu: ImuSamples | None, missing: str, tags: Sequence[TagSighting]
+    ) -> OdometryStep:
         tracks = self.tracker.process(frame)
-        self.starter.add(self._view(tracks), imu)
-        self._views = [*self._views, tracks][-len(self.starter.views) :]
+        self.starter.add(self._tag_start.with_tags(self._view(tracks), tags), imu)
+        self._views = [*self._views, (tracks, tags)][-len(self.starter.views) :]
         start = self.starter.find() if imu is not None else missing
         found = self._started(start) if isinstance(start, Started) else start
         if isinstance(found, str):
@@ -294,7 +303,7 @@ class InertialOdometry:
     def _started(self, start: Started) -> Window | str:
         """The window, begun with the images of the start, and solved; or why that failed."""
         stamps = {state.t_ns for state in start.states}
-        views = [tracks for tracks in self._views if tracks.t_ns in stamps]
+        views, seen = zip(*[(tracks, tags) for tracks, tags in self._views if tracks.t_ns in stamps], strict=True)
         still = start.how == "at rest"
         if still:
             chosen = np.array([0, len(views) - 1])
@@ -302,19 +311,24 @@ class InertialOdometry:
             chosen = np.unique(np.linspace(0, len(views) - 1, min(self.config.window.keyframes, len(views))).round())
         chosen = chosen.astype(int)
         moved = self._continued(start.states[int(chosen[0])])
-        states = [_moved(start.states[i], moved) for i in chosen]
+        start_states = [_moved(state, moved) for state in start.states]
+        states = [start_states[i] for i in chosen]
+        placed = self._placed(start, start_states, seen)
+        if isinstance(placed, str):
+            return placed
         sigma = StartSigma(
             tilt_rad=max(3.0 * start.sigma_tilt, 0.02), velocity_m_s=max(3.0 * start.sigma_velocity, 0.02),
             bias_gyro=max(3.0 * start.sigma_bias_gyro, 1e-3), bias_accel=self.config.start.bias_accel,
         )  # fmt: skip
         window = Window(self.rig, self.config.window, self.spec)
-        window.start(states[0], sigma, self._observations(views[int(chosen[0])]))
-        for i, state in zip(chosen[1:], states[1:], strict=True):
+        tags = [self._tag_start.views(window, state, seen[i], placed) for i, state in zip(chosen, states, strict=True)]
+        window.start(states[0], sigma, self._observations(views[int(chosen[0])]), tags[0])
+        for i, state, those in zip(chosen[1:], states[1:], tags[1:], strict=True):
             samples = self.stream.between(window.newest.t_ns, state.t_ns)
             if isinstance(samples, str):
                 return samples
             window.add_frame(
-                state.t_ns, samples, self._observations(views[i]), keyframe=True, standstill=still, guess=state
+                state.t_ns, samples, self._observations(views[i]), those, keyframe=True, standstill=still, guess=state
             )
         solution = window.solve(self.config.start_iterations)
         failure = self._failure(solution, window.newest)
@@ -324,9 +338,43 @@ class InertialOdometry:
         self.window, self._blind_since, self._surveyed.tied = window, None, False
         self._new_tags.seen.clear()
         self._probation.tried.clear()
+        for name in placed:
+            self._probation.admit(name, window.newest.t_ns)
+        self._check = self._scale_check(placed)
         self.starter.reset()
         self._views = []
         return window
+
+    def _placed(
+        self, start: Started, states: Sequence[NavState], seen: Sequence[Sequence[TagSighting]]
+    ) -> dict[str, SE3] | str:
+        """Where the tags in a start's images are; none where they tell nothing that is not known without them."""
+        if not start.tags and (self.starter.metric or start.how != "at rest"):
+            return {}
+        placed, wrong = self._tag_start.placed(states, seen)
+        for name, why in wrong.items():
+            self._name(name, states[-1].t_ns, why)
+        return placed if placed or not start.tags else f"it is not clear how {start.tags[0]} hangs"
+
+    def _scale_check(self, placed: Mapping[str, SE3]) -> ScaleCheck | None:
+        if self.starter.metric or not placed:
+            return None
+        assert self.window is not None
+        sizes = {s.name: s.size_m for _, tags in self._views for s in tags if s.name in placed and s.size_m}
+        return ScaleCheck(self.starter.anew(), sizes, self.window.newest.t_ns)
+
+    def _wrong_scale(self, tracks: Tracks, imu: ImuSamples, T_map_body: SE3) -> str:
+        """How large the tags are by which a window of one camera began, if not as they say."""
+        check = self._check
+        found = None if check is None else check.add(self._view(tracks), imu, T_map_body)
+        if check is None or (found is None and not check.over(tracks.t_ns)):
+            return ""
+        self._check = None
+        wrong = {name: why for name, one in (found or {}).items() if (why := one.contradicts(0.0))}
+        self._tag_start.refused |= set(wrong)
+        for name, why in wrong.items():
+            self._name(name, tracks.t_ns, why)
+        return "; ".join(f"it began by {name}, but {why}" for name, why in wrong.items())
 
     def _continued(self, first: NavState) -> SE3:
         """T_new_old, a turn about z and a shift, that puts a state where the last window was left."""
@@ -368,14 +416,15 @@ class InertialOdometry:
         assert self.window is not None
         self.emit(frame.t_ns, "failure", why=why)
         self._left_at = self.window.keyframes()[-1]
-        self.window, self._keyframe, self._blind_since = None, None, None
+        self._tag_start.refused |= set() if self._check is None else set(self._check.sizes)  # it may be their fault
+        self.window, self._keyframe, self._blind_since, self._check = None, None, None, None
         self.restarts += 1
         self.starter.reset()
         self._views = []
         self.tracker.reset()
         tracks = self.tracker.process(frame)
         self.starter.add(self._view(tracks), None)
-        self._views = [tracks]
+        self._views = [(tracks, ())]
         return OdometryStep(frame, "lost", self._nowhere(frame.t_ns), UNKNOWN_15, tracks, why=why)
 
     def _nowhere(self, t_ns: int) -> NavState:

@@ -9,15 +9,17 @@ for themselves how the tag hangs (`tags/survey.py`): both poses that the corners
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from lodelight.estimation.window import Window
-from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_log
 from lodelight.messages import TagSighting
+from lodelight.rig import CameraSpec
+from lodelight.tags.size import measured_size
 from lodelight.tags.survey import MappedTag, SurveyConfig, TagView, map_tag
 
 FRAMES = 3  # in a row in which a sighting must agree
@@ -26,36 +28,59 @@ MOST_VIEWS = 8
 AWAY_S = 2.0  # out of sight for longer, and it may have been moved
 ATTITUDE_CHI2 = 16.27  # 99.9 % of three degrees of freedom
 OFF_RAD = 0.01  # by which the window may be turned beyond its covariance, as in the test of one view
+SLOW_M_S = 0.1
 # The wrong one of two attitudes, whose chi-square is larger by E on average, seems better by 16 in 3e-5 of all cases at
 # most, whatever E is: the difference has the mean E and the deviation 2 sqrt(E).
 SURVEY = SurveyConfig(min_views=1, rival_chi2=16.0, hypotheses=2)
 
 
-def extended(views: list[TagView], s: TagSighting, T_map_cam: SE3) -> bool:
-    """Add a view unless it is from where the last one was; whether it was added. The oldest goes."""
-    if views and not (views[-1].T_world_cam.inverse() @ T_map_cam).exceeds(APART_M, APART_DEG):
-        return False
-    views.append(TagView(s, T_map_cam))
-    del views[:-MOST_VIEWS]
-    return True
+def scale_of(window: Window) -> float:
+    """Deviation of the window's lengths, as a share, by that of its velocity; 1 where it hardly moves."""
+    v = window.newest.v_world
+    speed2 = float(v @ v)
+    if speed2 < SLOW_M_S**2:
+        return 1.0
+    return min(math.sqrt(float(v @ window.covariance()[6:9, 6:9] @ v)) / speed2, 1.0)
+
+
+def views_apart(states: Iterable[tuple[TagSighting, SE3]]) -> list[TagView]:
+    """Of sightings and T_map_cam in the order of their stamps, those that say something new; the latest of many."""
+    out: list[TagView] = []
+    for s, T_map_cam in states:
+        if not out or (out[-1].T_world_cam.inverse() @ T_map_cam).exceeds(APART_M, APART_DEG):
+            out.append(TagView(s, T_map_cam))
+    return out[-MOST_VIEWS:]
+
+
+def in_window(window: Window, sightings: list[TagSighting], T_body_cam: SE3) -> list[tuple[TagSighting, SE3]]:
+    """Those whose frames are still there, which stay in the list, with T_map_cam as the window has it.
+
+    All from one solution: what the window believed before of absolute yaw and position was another guess.
+    """
+    at = {frame.t_ns: frame for frame in window.frames}
+    sightings[:] = [s for s in sightings if s.t_ns in at]
+    return [(s, at[s.t_ns].state.T_world_body @ T_body_cam) for s in sightings]
 
 
 @dataclass(eq=False)
 class _Tried:
-    """agreed : frames in a row; admitted : it has a say; why : it was found to hang otherwise"""
+    """agreed : frames in a row; admitted : it has a say; why : it was found to hang otherwise, or of another size
+    named : so that it is told once while it is in sight
+    """
 
     seen_ns: int
     agreed: int = 0
     admitted: bool = False
+    named: bool = False
     why: str = ""
-    views: list[TagView] = field(default_factory=list)
+    seen: list[TagSighting] = field(default_factory=list)
 
 
 @dataclass(eq=False)
 class Probation:
     """tried : by name, tags in sight"""
 
-    camera: Camera
+    spec: CameraSpec
     tried: dict[str, _Tried] = field(default_factory=dict)
 
     def holds(self, name: str, t_ns: int) -> bool:
@@ -70,23 +95,35 @@ class Probation:
         """Its views have shown where it hangs already."""
         self.tried[name] = _Tried(t_ns, admitted=True)
 
-    def contradicted(self, name: str) -> None:
-        """It has failed the window's test."""
-        one = self.tried.get(name)
-        if one is not None:
-            one.agreed, one.admitted, one.views = 0, False, []
+    def named(self, name: str) -> bool:
+        """Whether a tag in sight was named before this was asked."""
+        one = self.tried[name]
+        before, one.named = one.named or bool(one.why), True
+        return before
 
-    def agreed(self, s: TagSighting, window: Window, T_body_cam: SE3) -> str:
-        """A sighting in the newest frame passed the window's test: admit its tag, if the views settle that; how else
-        it hangs, the first time that they say so, otherwise nothing."""
+    def judge(self, s: TagSighting, window: Window, rejected: bool) -> str:
+        """After a solve with a sighting in the newest frame, which failed the window's test or not: admit its tag, if
+        the views settle that; what else they say, the first time, otherwise nothing."""
         one = self.tried[s.name]
+        if rejected and one.admitted:
+            one.admitted, one.seen = False, []
+        one.agreed = 0 if rejected else one.agreed + 1
         if one.admitted or one.why or s.size_m is None:
             return ""
-        one.agreed += 1
-        new = extended(one.views, s, window.newest.T_world_body @ T_body_cam)
-        if one.agreed < FRAMES or not (new or one.agreed == FRAMES):
+        one.seen.append(s)
+        views = views_apart(in_window(window, one.seen, self.spec.T_body_cam))
+        if views[-1].sighting is not s and one.agreed != FRAMES:  # from where the last one was
             return ""
-        found = map_tag(one.views, s.size_m, self.camera, SURVEY)
+        measured = measured_size(views, s.size_m, self.spec.camera) if rejected or one.agreed >= FRAMES else None
+        one.why = measured.contradicts(scale_of(window)) if measured is not None else ""
+        if not one.why and one.agreed >= FRAMES:
+            one.why = self._turned(views, s, window)
+        return one.why
+
+    def _turned(self, views: list[TagView], s: TagSighting, window: Window) -> str:
+        """By how much a tag is turned from where it is believed; if not at all, and that is clear, it is admitted."""
+        assert s.size_m is not None
+        found = map_tag(views, s.size_m, self.spec.camera, SURVEY)
         if not isinstance(found, MappedTag):
             return ""
         believed, covariance = window.tag(s.name)
@@ -96,13 +133,7 @@ class Probation:
         S = found.covariance[:3, :3] + covariance[:3, :3] + of_window + OFF_RAD**2 * np.eye(3)
         if float(d @ np.linalg.solve(S, d)) > ATTITUDE_CHI2:
             turned = math.degrees(float(np.linalg.norm(d)))
-            one.why = f"its views say that it is turned by {turned:.0f} deg from where it should hang; it is not used"
-            return one.why
-        one.admitted = True
+            return f"its views say that it is turned by {turned:.0f} deg from where it should hang; it is not used"
+        self.tried[s.name].admitted = True
         window.admit(s.name)
         return ""
-
-    def move(self, T_new_old: SE3) -> None:
-        """Into another frame."""
-        for one in self.tried.values():
-            one.views = [TagView(v.sighting, T_new_old @ v.T_world_cam) for v in one.views]

@@ -15,16 +15,14 @@ import numpy as np
 
 from lodelight.anchors import tag_corners
 from lodelight.estimation.window import Tag, TagView, Window
-from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.messages import TagSighting
-from lodelight.odometry.probation import Probation, extended
+from lodelight.odometry.probation import Probation, in_window, scale_of, views_apart
+from lodelight.rig import CameraSpec
 from lodelight.tags.gate import GateConfig
 from lodelight.tags.pose import by_gravity, clear, tag_poses
+from lodelight.tags.size import measured_size
 from lodelight.tags.survey import MappedTag, map_tag
-from lodelight.tags.survey import TagView as View
-
-OLD_S = 10.0  # the odometry's frame drifts, and what was seen before this says no more
 
 
 def tag_views(
@@ -62,28 +60,42 @@ def tag_views(
 
 @dataclass(eq=False)
 class NewTags:
-    """Sightings of tags that have no place yet, by name, from where the window had the camera at the time."""
+    """Sightings of tags that have no place yet, by name, as far as their frames are in the window."""
 
-    camera: Camera
-    seen: dict[str, list[View]] = field(default_factory=dict)
+    spec: CameraSpec
+    seen: dict[str, list[TagSighting]] = field(default_factory=dict)
+    _wrong: dict[str, tuple[int, str]] = field(default_factory=dict)  # when, and why
+    _told: set[str] = field(default_factory=set)
 
-    def place(self, s: TagSighting, T_map_cam: SE3) -> SE3 | None:
-        """T_map_tag by this sighting from T_map_cam, and those before it; None where two poses still fit."""
+    def place(self, s: TagSighting, T_map_cam: SE3, window: Window) -> SE3 | None:
+        """T_map_tag by this sighting from T_map_cam, later than the window, and those before it.
+
+        None where two poses still fit, where a single place does not tell how large it is, or where it is not as large
+        as it says.
+        """
         if s.size_m is None:
             return None
-        poses = tag_poses(s, s.size_m, self.camera)
+        before = self.seen.setdefault(s.name, [])
+        views = views_apart([*in_window(window, before, self.spec.T_body_cam), (s, T_map_cam)])
+        before.append(s)
+        if views[-1].sighting is not s:
+            return None
+        measured = measured_size(views, s.size_m, self.spec.camera)
+        if measured is None:
+            return None
+        why = measured.contradicts(scale_of(window))
+        if why:
+            self._wrong[s.name] = s.t_ns, why
+            return None
+        poses = tag_poses(s, s.size_m, self.spec.camera)
         settled = clear(poses, s) or (by_gravity(poses, T_map_cam.R[2]) if len(poses) > 1 else None)
         if settled is not None:
             return T_map_cam @ settled.T_cam_tag
-        views = [v for v in self.seen.get(s.name, ()) if (s.t_ns - v.sighting.t_ns) * 1e-9 < OLD_S]
-        if not extended(views, s, T_map_cam):
-            return None
-        self.seen[s.name] = views
-        found = map_tag(views, s.size_m, self.camera)
+        found = map_tag(views, s.size_m, self.spec.camera)
         return found.T_world_tag if isinstance(found, MappedTag) else None
 
-    def move(self, T_new_old: SE3) -> None:
-        """Into another frame."""
-        self.seen = {
-            name: [View(v.sighting, T_new_old @ v.T_world_cam) for v in views] for name, views in self.seen.items()
-        }
+    def wrong(self) -> list[tuple[str, int, str]]:
+        """Tags that were found to be of another size, when, and what is wrong; each once."""
+        out = [(name, *said) for name, said in self._wrong.items() if name not in self._told]
+        self._told |= {name for name, _, _ in out}
+        return out
