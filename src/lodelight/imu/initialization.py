@@ -154,7 +154,7 @@ class Starter:
     def find(self) -> Started | str:
         """The start, or what is missing. Raises SourceError where the IMU's units are wrong."""
         c = self.config
-        shortest_s = c.shortest_tag_s if self._tags else c.shortest_metric_s if self.metric else c.shortest_s
+        shortest_s = c.shortest_tag_s if self._tags else self._without_tags_s
         if len(self.views) < 3 or self._span_s < min(c.rest_s, shortest_s) - 1e-6:
             return (
                 f"{self._span_s:.2f} s of images and IMU so far; {c.rest_s:.2f} s are needed standing still, "
@@ -168,8 +168,18 @@ class Starter:
             return at_rest
         if self._span_s < shortest_s - 1e-6:
             return f"{at_rest}; in motion {shortest_s:.2f} s are needed, there are {self._span_s:.2f}"
-        in_motion = self._in_motion()
+        in_motion = self._in_motion(self._span_s >= self._without_tags_s)
         return in_motion if isinstance(in_motion, Started) else f"{at_rest}; {in_motion}"
+
+    def in_motion(self) -> Started | str:
+        """The start in motion or what is missing, for one who has started already."""
+        if self._span_s < self._without_tags_s:
+            return "too short"
+        return self._in_motion(False)
+
+    @property
+    def _without_tags_s(self) -> float:
+        return self.config.shortest_metric_s if self.metric else self.config.shortest_s
 
     # -- at rest ------------------------------------------------------------------------------------------------
 
@@ -214,7 +224,8 @@ class Starter:
 
     # -- in motion ----------------------------------------------------------------------------------------------
 
-    def _in_motion(self) -> Started | str:
+    def _in_motion(self, suspicious: bool) -> Started | str:
+        """suspicious : raise SourceError where the accelerometer's sign seems to be turned"""
         c = self.config
         track_a, _ray_a = self.views[0].first_camera()
         track_b, _ = self.views[-1].first_camera()
@@ -224,13 +235,12 @@ class Starter:
             return f"{lasting} tracks last for {self._span_s:.1f} s, {c.min_tracks} are needed"
         bias = self._gyro_bias()
         motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
-        if not (self.metric or self._tags):
-            parallax = self._parallax_deg(motions)
-            if parallax < c.min_parallax_deg:
-                return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
+        parallax = math.inf if self.metric else self._parallax_deg(motions)
+        if parallax < c.min_parallax_deg and not self._tags:
+            return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
         sigma_ray = c.sigma_px / self.focal_px
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray, (0.2 * c.bias_gyro, c.bias_accel))
-        if found == BEHIND:
+        if found == BEHIND and suspicious and parallax >= c.min_parallax_deg:
             self._refuse_turned_sign(rows, sigma_ray, bias)
         if isinstance(found, str):
             return found

@@ -134,8 +134,8 @@ class ScaleCheck:
         if (view.t_ns - max(self._tried_ns, self.started_ns)) * 1e-9 < CHECK_EVERY_S:
             return None
         self._tried_ns = view.t_ns
-        found = self.starter.find()
-        if isinstance(found, str) or found.how != "in motion":
+        found = self.starter.in_motion()
+        if isinstance(found, str):
             return None
         theirs = np.array([state.T_world_body.t for state in found.states])
         far = int(np.argmax(np.linalg.norm(theirs - theirs[0], axis=1)))

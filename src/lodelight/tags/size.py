@@ -23,8 +23,8 @@ from lodelight.types import Array
 
 STEPS = 15
 RIGHT = GateConfig.size_ratio - 1.0  # a share of its size by which a tag may differ in any case
-SIGMAS = 3.0
-UNKNOWN = 0.2  # relative deviation of k at which views say nothing of it
+SIGMAS = 4.0
+UNKNOWN = 0.1  # relative deviation of k at which views say nothing of it
 
 
 @dataclass(frozen=True)
