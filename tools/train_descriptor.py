@@ -12,7 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lodelight.features.orb import PATCH_RADIUS, OrbExtractor, orientations
+from lodelight.features.corners import find_corners
+from lodelight.features.orb import BORDER, PATCH_RADIUS, OrbExtractor, orientations
 from lodelight.geometry.cameras import Camera
 
 N_PAIRS = 256
@@ -36,7 +37,7 @@ def bits_of(path, pairs, per_image, rng):
     extractor = OrbExtractor(Camera.create("radtan", width, height, (width, width, width / 2, height / 2)))
     rows = []
     for octave, level in enumerate(extractor.pyramid(image)):
-        corners = extractor._corners(level, extractor._quota[octave])
+        corners = find_corners(level, int(extractor._quota[octave]), extractor.config.fast_threshold, BORDER)
         corners = corners[rng.permutation(len(corners))[: per_image // 8]]
         angle = orientations(level, corners).astype(float)
         smooth = cv2.GaussianBlur(level, (7, 7), 2.0)
