@@ -12,12 +12,15 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from lodelight.doctor.examine import judge, look
-from lodelight.doctor.gather import Seen
+from lodelight.doctor.gather import RIMS_EVERY, Seen
+from lodelight.doctor.rims import Rims, rims_of
 from lodelight.geometry.cameras import Camera
 from lodelight.io import open_source
+from lodelight.io.recording import Recording
 from lodelight.messages import Imu
 from lodelight.rig import Rig
 
@@ -31,6 +34,7 @@ NAMED = (
     "gyro unit",
     "swapped cameras",
     "IMU shift",
+    "depth on image",
     "tag focal",
     "tag aspect",
     "tag squareness",
@@ -65,7 +69,8 @@ def late(seen: Seen, ms: float) -> Seen:
     return replace(seen, imu=[Imu(s.t_ns + shift, s.gyro, s.accel) for s in seen.imu])
 
 
-def faults(seen: Seen, rig: Rig, rng: np.random.Generator) -> dict[str, Callable[[], tuple[Seen, Rig]]]:
+def faults(recording: Recording, seen: Seen, rng: np.random.Generator) -> dict[str, Callable[[], tuple[Seen, Rig]]]:
+    rig = recording.rig
     out: dict[str, Callable[[], tuple[Seen, Rig]]] = {}
     stereo, inertial = len(rig.cameras) > 1, rig.imu is not None
     if inertial:
@@ -83,6 +88,31 @@ def faults(seen: Seen, rig: Rig, rng: np.random.Generator) -> dict[str, Callable
     if inertial:
         out["focal +3 %"] = lambda: (seen, longer(rig, 1.03))
         out["focal -3 %"] = lambda: (seen, longer(rig, 0.97))
+    if rig.depth is not None:
+        out["depth 3 cm"] = lambda: (replace(seen, rims=beside_the_image(recording, 0.03, 0.0, rng)), rig)
+        out["depth 3 deg"] = lambda: (replace(seen, rims=beside_the_image(recording, 0.0, 3.0, rng)), rig)
+    return out
+
+
+def beside_the_image(recording: Recording, metres: float, degrees: float, rng: np.random.Generator) -> list[list[Rims]]:
+    """Rims of a recording whose depth lies as by a sensor shifted and turned across its axis."""
+    lens = recording.rig.cameras[0].camera
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    across = np.array([np.cos(angle), np.sin(angle)])
+    out = []
+    for frame in list(recording.frames(1, True, 0.0, 24.0))[::RIMS_EVERY]:
+        if frame.depth is None:
+            continue
+        v, u = np.nonzero(np.nan_to_num(frame.depth) > 0)
+        z = frame.depth[v, u]
+        far_first = np.argsort(-z, kind="stable")
+        move = lens.focal_px * (np.radians(degrees) + metres / z[far_first, None]) * across
+        x, y = (np.stack([u, v], 1)[far_first] + np.rint(move)).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < lens.width) & (y < lens.height)
+        depth = np.zeros_like(frame.depth)
+        depth[y[inside], x[inside]] = z[far_first][inside]
+        depth = np.where(depth == 0, cv2.medianBlur(depth, 3), depth)  # pixels that no reading fell on
+        out.append(rims_of(frame.images[0], depth, lens.focal_px))
     return out
 
 
@@ -97,7 +127,7 @@ def main(paths: list[str]) -> None:
             f"{recording.name}: as it is: {'; '.join(f'{f.name}: {f.text}' for f in good) or 'nothing named'}",
             flush=True,
         )
-        for name, make in faults(seen, rig, rng).items():
+        for name, make in faults(recording, seen, rng).items():
             named = [f for f in judge(*make()) if f.level == "fault" and f.name in NAMED]
             print(
                 f"    {name:16} {'; '.join(f'{f.name} {f.value:.2f} {f.unit}' for f in named) or 'NOT NAMED'}",

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from lodelight.cli.main import main
 from lodelight.doctor import signals
 from lodelight.doctor.examine import judge
 from lodelight.doctor.gather import Pair, Seen, blur_of, matched
+from lodelight.doctor.rims import beside, rims_of
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp, so3_log
@@ -193,6 +195,53 @@ def test_tags_that_are_no_squares_tell_of_the_lens(walked):
 
 
 # -- one sensor by itself ----------------------------------------------------------------------------------------------
+
+
+def boxes(seed, shift_m=(0.0, 0.0), turn_rad=(0.0, 0.0), frames=12):
+    """Rims of boxes 1 to 3.5 m away before a wall at 5 m, as by a depth sensor that stands otherwise than is stated."""
+    rng = np.random.default_rng(seed)
+    seen, focal = [], LENS.focal_px
+    for _ in range(frames):
+        image = rng.normal(90.0, 12.0, (LENS.height, LENS.width)).astype(np.float32)
+        depth = np.full(image.shape, 5.0, np.float32)
+        for z in -np.sort(-rng.uniform(1.0, 3.5, 7)):  # the farthest first
+            half = focal * 0.15 / z
+            middle = rng.uniform(half, [LENS.width - half, LENS.height - half])
+            for picture, value, moved in ((image, rng.uniform(0, 255), 0.0), (depth, z, 1.0)):
+                at = middle + moved * focal * (np.array(turn_rad) + np.array(shift_m) / z)
+                (x0, y0), (x1, y1) = (np.clip(np.rint(at + s * half), 0, None).astype(int) for s in (-1, 1))
+                picture[y0:y1, x0:x1] = value
+        image = cv2.GaussianBlur(image, (0, 0), 0.8).clip(0, 255).astype(np.uint8)
+        depth[rng.random(depth.shape) < 0.02] = 0.0
+        seen.append(rims_of(image, depth, focal))
+    return beside(seen)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_depth_that_lies_on_the_image_is_found_there(seed):
+    found = boxes(seed)
+    assert np.hypot(*found.px) < 1.5
+    assert found.sigma_px < 1.5
+
+
+@pytest.mark.parametrize("axis", [(0.03, 0.0), (0.0, -0.03)])
+def test_a_depth_sensor_three_centimetres_beside_its_place_is_found_by_the_rims_of_things(axis):
+    found = boxes(3, shift_m=axis)
+    for distance_m, x, y in found.bands:
+        np.testing.assert_allclose([x, y], LENS.focal_px * np.array(axis) / distance_m, atol=2.0)
+    assert np.hypot(*found.px) > 4.0 * found.sigma_px
+    assert len(found.bands) > 1
+
+
+def test_a_depth_sensor_turned_by_three_degrees_is_found_by_the_rims_of_things():
+    turn = np.radians([2.4, -1.8])
+    found = boxes(4, turn_rad=turn)
+    np.testing.assert_allclose(found.px, LENS.focal_px * turn, atol=2.0)
+
+
+def test_images_without_rims_tell_nothing():
+    assert beside([]) is None
+    assert beside([rims_of(np.full((60, 80), 7, np.uint8), np.zeros((60, 80), np.float32), 80.0)] * 9) is None
 
 
 def test_stamps_with_gaps_and_disorder_are_told_with_their_amount():

@@ -11,6 +11,7 @@ from lodelight.doctor.findings import Finding, measured
 from lodelight.doctor.gather import BUDGET_FRAMES, STRETCH_S, Seen, gather
 from lodelight.doctor.lever import lever_of
 from lodelight.doctor.metric import Move, field_of, move_of
+from lodelight.doctor.rims import beside
 from lodelight.doctor.squares import squares_of
 from lodelight.doctor.turning import Gyro, align, turn_of
 from lodelight.io.recording import Recording
@@ -22,7 +23,8 @@ from lodelight.types import Array
 # Limits: half of what spoils a run, and above what good recordings of known rigs show (docs/doctor.md).
 OFFSET_MS, TURN_DEG, FOCAL, EPIPOLAR_PX, AIM_CM, REGION_PX = 3.5, 1.3, 0.018, 1.0, 1.0, 1.0
 SHIFT_CM, SQUARE_PX, ASPECT = 2.0, 1.0, 0.015
-SURE = 2.5  # sigmas of a time offset, which know how alike errors are (`findings.jackknifed`); others need four
+DEPTH_PX, DEPTH_DEG = 2.5, 0.5
+SURE = 2.5  # sigmas that know how alike errors are (`findings.jackknifed`, `rims.beside`); others need four
 DEGREES = (40.0, 80.0)  # what a gyro in degrees shows over what vision does
 
 
@@ -65,7 +67,7 @@ def judge(seen: Seen, rig: Rig, recording: Recording | None = None) -> list[Find
     out += eyes
     if swapped:
         return out  # the images are those of the other camera: nothing further would be about this rig
-    out += _squares(seen, rig)
+    out += _squares(seen, rig) + _rims(seen, rig)
     cam0, cam1 = rig.cameras[0], rig.cameras[1] if len(rig.cameras) > 1 else None
     wrong = any(f.level == "fault" for f in eyes)  # points of a wrong pair would miss everywhere
     moves = [] if wrong else [m for pair in seen.pairs if (m := move_of(pair, cam0, cam1)) is not None]
@@ -144,6 +146,24 @@ def _squares(seen: Seen, rig: Rig) -> list[Finding]:
             )
         )  # fmt: skip
     return out
+
+
+def _rims(seen: Seen, rig: Rig) -> list[Finding]:
+    if rig.depth is None:
+        return []
+    found = beside(seen.rims)
+    if found is None:
+        return [Finding("depth on image", "note", "too few things stand out to hold depth against the image")]
+    of = "; ".join(f"{x:+.0f}, {y:+.0f} px at {distance_m:.1f} m" for distance_m, x, y in found.bands)
+    limit_px = max(DEPTH_PX, np.radians(DEPTH_DEG) * rig.cameras[0].camera.focal_px)
+    return [
+        measured(
+            "depth on image", float(np.hypot(*found.px)), found.sigma_px, limit_px, "px",
+            "rims of things are at the same place in depth and image, to {value:.1f} px (+- {sigma:.1f})",
+            "extrinsics: depth lies {value:.1f} px (+- {sigma:.1f}) beside cam0's image (" + of + "); "
+            "calibrate T_body_depth anew", times=SURE,
+        )
+    ]  # fmt: skip
 
 
 def _regions(moves: list[Move], cam0: CameraSpec) -> list[Finding]:

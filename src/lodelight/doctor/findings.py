@@ -39,7 +39,7 @@ def measured(
     unsure = 3.0 * sigma > 2.0 * limit
     text = (bad if wrong else good).format(value=value, sigma=sigma)
     if not wrong and unsure:
-        text = f"this motion does not tell it (within {sigma:.2g} {unit})"
+        text = f"this recording does not tell it (within {sigma:.2g} {unit})"
     return Finding(name, "fault" if wrong else "ok", text, value, unit, sigma)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lodelight.doctor.rims import Rims, rims_of
 from lodelight.io.recording import Recording
 from lodelight.io.stamps import NS_PER_S
 from lodelight.messages import Frame, Imu, TagSighting
@@ -22,6 +23,7 @@ CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 STRETCH_S, BUDGET_FRAMES = 4.0, 360
 RETURN_PX = 0.5  # by how much a corner may miss itself when it is tracked there and back
 ORB_EVERY, N_ORB = 8, 800
+RIMS_EVERY = 4
 TAGS_EVERY, TAGS = 6, ("qr", "tag36h11")
 
 
@@ -43,12 +45,14 @@ class Seen:
 
     pairs : those of one stretch follow one another, each beginning where the last one ended
     stereo : matched corners of frames, (N, 2) px in camera 0 and in camera 1, found without the rig
+    rims : of depth, in every RIMS_EVERYth frame
     tags : of TAGS in every TAGS_EVERYth frame
     brightness : (mean, share that is black, share that is white) of frames; sharpness : `blur_of` them
     """
 
     pairs: list[Pair] = field(default_factory=list)
     stereo: list[tuple[Array, Array]] = field(default_factory=list)
+    rims: list[list[Rims]] = field(default_factory=list)
     brightness: list[tuple[float, float, float]] = field(default_factory=list)
     blur: list[float] = field(default_factory=list)
     imu: list[Imu] = field(default_factory=list)
@@ -75,6 +79,8 @@ def gather(recording: Recording, stretches: list[tuple[float, float]]) -> Iterat
                 seen.tags += detector.detect(frame.images[0], frame.t_ns, thorough=True)
             if len(frame.images) > 1 and i % ORB_EVERY == 0:
                 seen.stereo.append(matched(frame.images[0], frame.images[1]))
+            if frame.depth is not None and i % RIMS_EVERY == 0:
+                seen.rims.append(rims_of(frame.images[0], frame.depth, rig.cameras[0].camera.focal_px))
             if open_pair is not None:
                 open_pair.follow(frame)
                 lost = frame.t_ns - open_pair.last_ns > 3 * period_s * NS_PER_S
