@@ -52,12 +52,12 @@ class Seen:
 
     pairs: list[Pair] = field(default_factory=list)
     stereo: list[tuple[Array, Array]] = field(default_factory=list)
-    rims: list[list[Rims]] = field(default_factory=list)
     brightness: list[tuple[float, float, float]] = field(default_factory=list)
     blur: list[float] = field(default_factory=list)
     imu: list[Imu] = field(default_factory=list)
     t_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     tags: list[TagSighting] = field(default_factory=list)
+    rims: list[list[Rims]] = field(default_factory=list)
 
 
 def gather(recording: Recording, stretches: list[tuple[float, float]]) -> Iterator[tuple[Seen, int]]:
