@@ -105,7 +105,7 @@ class Points:
             there = there + self.off + self.sigma_px * self.rng.standard_normal(px.shape)
             right[seen] = there[seen]
         none = np.zeros(len(px))
-        noise = (self.sigma_px, self.sigma_px, self.wander_px2)
+        noise = (np.full(len(px), self.sigma_px), np.full(len(px), self.sigma_px), np.full(len(px), self.wander_px2))
         now = Tracks(frame.t_ns, self.ids, self.age, px.astype(np.float32), ray, right, none, none, *noise)
         if self.tracks is not None:
             self._compare(self.tracks, now)

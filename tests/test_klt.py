@@ -83,6 +83,20 @@ def test_two_cameras_give_depth():
     assert np.median(np.abs(error)) < 1.0
 
 
+def test_tracks_on_the_edge_of_something_nearer_are_noisier():
+    """Grey posts before the wall: patches with a part of one show two disparities."""
+    images = [plane(np.zeros(3)), plane(np.array([BASELINE_M, 0.0, 0.0]))]
+    for image, shift in zip(images, (0, 14), strict=True):  # the wall's: 11.5
+        for left in (80, 180, 280):
+            image[:, left - shift : left - shift + 5] = 128
+    rows = np.arange(30.0, 210.0, 12.0)
+    edge = np.array([(at, row) for at in (84, 184, 284) for row in rows], np.float32)
+    px = np.vstack([edge, edge + np.float32([40.0, 0.0])])
+    _, found, noise = KltTracker(rig(2), "stereo", CONFIG)._flow(*images, px, px - np.float32([11.5, 0.0]))
+    assert found[: len(edge)].sum() > 10
+    assert np.median(noise[: len(edge)][found[: len(edge)]]) > 2.0 * np.median(noise[len(edge) :])
+
+
 def test_same_frames_give_same_bytes():
     runs = []
     for _ in range(2):

@@ -28,13 +28,17 @@ from lodelight.types import AnyArray, Array, ArrayF32, Bools, Bytes, Ints
 UNAIDED_SIGMA = 0.01  # rad: of a turn by the images alone, which takes part of the translation for turning
 STEREO_BOUND = 2.0  # what calibration adds to the noise across the epipolar plane
 LEAST_STEP_PX = 0.03  # no patch is followed better
-LENS_PATCHES, LENS_REACH_PX = 12, 200.0  # a track that moved so far is off by something else
+LEAST_NOISE = 0.5  # of a patch, of the median of all
+LEAST_GRADIENT2 = 1e-8  # and likewise of the median noise
+LENS_PATCHES, LENS_REACH_RAD = 12, 0.44  # a track that moved so far is off by something else
+LEAST_WINDOW_PX, MOST_WINDOW_PX = 9, 21
 
 
 @dataclass(frozen=True)
 class KltConfig:
     """tracks : so many are kept alive, at least spacing_px apart
-    window_px, levels : of the patch, and pyramid levels above the image
+    patch_rad, levels : side of a patch, which is to show one thing whatever the resolution; pyramid levels above the
+        image
     back_px : a track followed back must return to within this
     min_quality : of a new corner, as a share of a good one's (the 90 % quantile of the best of every cell)
     min_contrast : least smaller eigenvalue of a corner's gradients, in squared grey values a pixel: below is noise
@@ -42,12 +46,12 @@ class KltConfig:
     sigma_px : noise of a track; bound : outlier bound of the common motion in units of it
     wander : over ten frames and more a track leaves its point by so many times what single steps would add up to,
         measured on rendered images (docs/inertial.md)
-    lens_px : what a lens model is off by, alike within patches of the image, of which there are LENS_PATCHES
+    lens_rad : what a lens model is off by, alike within patches of the image, of which there are LENS_PATCHES
     """
 
     tracks: int = 180
     spacing_px: float = 20.0
-    window_px: int = 15
+    patch_rad: float = 0.033
     levels: int = 2
     back_px: float = 0.7
     min_quality: float = 0.05
@@ -56,7 +60,7 @@ class KltConfig:
     sigma_px: float = 0.5
     bound: float = 3.0
     wander: float = 1.5
-    lens_px: float = 0.15
+    lens_rad: float = 3.3e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +71,8 @@ class Tracks:
     px : (N, 2) float32, raw pixels; ray : (N, 3) unit rays, camera 0
     px_right : (N, 2) float32, raw pixels of camera 1, NaN where it was not found there
     inv_depth, sigma_inv_depth : (N,) float64 1/m along camera 0's z, 0 = not measured
-    step_px, right_px : noise of a step from the last frame, and from camera 0 to camera 1, as this frame's tracks show
-    wander_px2 : variance of how far a track followed through all frames so far has left its point
+    step_px, right_px : (N,) noise of a step from the last frame, and from camera 0 to camera 1
+    wander_px2 : (N,) variance of how far the track has left its point since it began
     """
 
     t_ns: int
@@ -79,9 +83,9 @@ class Tracks:
     px_right: ArrayF32
     inv_depth: Array
     sigma_inv_depth: Array
-    step_px: float = LEAST_STEP_PX
-    right_px: float = LEAST_STEP_PX
-    wander_px2: float = 0.0
+    step_px: Array
+    right_px: Array
+    wander_px2: Array
 
     def __len__(self) -> int:
         return len(self.id)
@@ -89,7 +93,8 @@ class Tracks:
     @staticmethod
     def none(t_ns: int) -> Tracks:
         px, number = np.zeros((0, 2), np.float32), np.zeros(0)
-        return Tracks(t_ns, np.zeros(0, np.int64), np.zeros(0, np.int32), px, np.zeros((0, 3)), px, number, number)
+        columns = (np.zeros(0, np.int64), np.zeros(0, np.int32), px, np.zeros((0, 3)), px)
+        return Tracks(t_ns, *columns, number, number, number, number, number)
 
     @property
     def stereo(self) -> Bools:
@@ -100,6 +105,7 @@ class Tracks:
         return replace(
             self, id=self.id[index], age=self.age[index], px=self.px[index], ray=self.ray[index],
             px_right=self.px_right[index], inv_depth=self.inv_depth[index], sigma_inv_depth=self.sigma_inv_depth[index],
+            step_px=self.step_px[index], right_px=self.right_px[index], wander_px2=self.wander_px2[index],
         )  # fmt: skip
 
 
@@ -131,13 +137,15 @@ class KltTracker:
         self.right: CameraSpec | None = rig.cameras[1] if sensors == "stereo" else None
         self.depth = rig.depth if sensors == "rgbd" else None
         self.flow = Flow(np.eye(3))
+        focal_px = self.camera.focal_px
+        half = round(0.5 * (self.config.patch_rad * focal_px - 1.0))
+        self._window_px = min(max(2 * half + 1, LEAST_WINDOW_PX), MOST_WINDOW_PX)
+        self._lens_px = self.config.lens_rad * focal_px
         self._seed = seed + 1
         self._equalizer = cv2.createCLAHE(self.config.equalize, (8, 8)) if self.config.equalize > 0 else None
         self._next_id = 0
         self._last: Bytes | None = None
         self._tracks: Tracks | None = None
-        self._step_px = self.config.sigma_px
-        self._wander_px2 = 0.0
         self._drift = np.zeros((0, 2), np.float32)  # of each track, px: its last flow beyond what turning explains
 
     @property
@@ -160,8 +168,6 @@ class KltTracker:
         else:
             tracks, drift = self._follow(image, frame.t_ns, R_now_last, sigma_rotation)
         followed = len(tracks)
-        self._wander_px2 += (self.config.wander * self._step_px) ** 2 + self._lens_px2(followed)
-        tracks = replace(tracks, step_px=self._step_px, wander_px2=self._wander_px2)
         tracks = _with_new(tracks, self._new_corners(image, tracks), self.camera, self._next_id)
         self._next_id += len(tracks) - followed
         usual = np.median(drift, axis=0) if followed else np.zeros(2)
@@ -189,8 +195,8 @@ class KltTracker:
     def _lens_px2(self, followed: int) -> float:
         """What the lens adds to a track's wander in this frame. Tracks of one patch of the image share its error, and
         together know no more than one of them: each is given as much more noise."""
-        share = min(self.flow.moved_px / LENS_REACH_PX, 1.0)
-        return 2.0 * self.config.lens_px**2 * share * max(followed / LENS_PATCHES, 1.0)
+        share = min(self.flow.moved_px / (LENS_REACH_RAD * self.camera.focal_px), 1.0)
+        return 2.0 * self._lens_px**2 * share * max(followed / LENS_PATCHES, 1.0)
 
     def _equalized(self, image: Bytes) -> Bytes:
         return image if self._equalizer is None else np.asarray(self._equalizer.apply(image), np.uint8)
@@ -204,7 +210,7 @@ class KltTracker:
         R = np.eye(3) if R_now_last is None else R_now_last
         turned, seen = self.camera.project(old.ray @ R.T)
         guess = np.where(seen[:, None], turned, old.px).astype(np.float32)
-        px, found = self._flow(self._last, image, old.px, guess + self._drift)
+        px, found, noise = self._flow(self._last, image, old.px, guess + self._drift)
         keep = np.flatnonzero(found & self.camera.inside(px.astype(np.float64), 2.0))
         ray, real = self.camera.unproject(px[keep].astype(np.float64))
         keep, ray = keep[real], ray[real]
@@ -214,32 +220,53 @@ class KltTracker:
         R, t, right, parallax = fit_two_view(
             old.ray[keep], ray, np.ascontiguousarray(R), sigma_rotation, sigma, self.config.bound, self._seed
         )
-        self._step_px = _noise_px(epipolar_noise(old.ray[keep], ray, R, t), self.camera, self._step_px)
+        rad = epipolar_noise(old.ray[keep], ray, R, t, noise[keep])
+        step_px = self._scaled(noise[keep], rad * self.camera.focal_px)
         moved = float(np.median(np.linalg.norm(px[keep] - old.px[keep], axis=1))) if len(keep) else 0.0
         self.flow = Flow(R, parallax, moved, len(old), len(keep), int(np.count_nonzero(~right)))
-        keep, ray = keep[right], ray[right]
+        keep, ray, step_px = keep[right], ray[right], step_px[right]
         n, none = len(keep), np.zeros(len(keep))
         alone = np.full((n, 2), np.nan, np.float32)
-        tracks = Tracks(t_ns, old.id[keep], old.age[keep] + np.int32(1), px[keep], ray, alone, none, none)
+        wander_px2 = old.wander_px2[keep] + (self.config.wander * step_px) ** 2 + self._lens_px2(n)
+        tracks = Tracks(
+            t_ns, old.id[keep], old.age[keep] + np.int32(1), px[keep], ray, alone, none, none, step_px, none, wander_px2
+        )
         by_turning, _ = self.camera.project(old.ray[keep] @ R.T)
         return tracks, (px[keep] - by_turning).astype(np.float32)
 
-    def _flow(self, a: Bytes, b: Bytes, px: ArrayF32, guess: ArrayF32) -> tuple[ArrayF32, Bools]:
-        """Where patches of a are in b, and which of them return to where they came from."""
+    def _scaled(self, noise: Array, px: float) -> Array:
+        """(N,) px that tracks err by: their patches' noise (N,) times px, or usual ones where that is not known."""
+        if not len(noise):
+            return noise
+        scale = px if math.isfinite(px) else self.config.sigma_px / float(np.median(noise))
+        return np.maximum(scale * noise, LEAST_STEP_PX)
+
+    def _flow(self, a: Bytes, b: Bytes, px: ArrayF32, guess: ArrayF32) -> tuple[ArrayF32, Bools, Array]:
+        """Where patches of a are in b, which of them return to where they came from, and their noise but for its scale.
+
+        That of Lucas-Kanade's least squares: what is left of the patches' difference over the weaker gradient. Where a
+        patch shows two depths, or an edge before another, it is large.
+        """
         if len(px) == 0:
-            return px, np.zeros(0, bool)
+            return px, np.zeros(0, bool), np.zeros(0)
         c = self.config
-        size, flags = (c.window_px, c.window_px), cv2.OPTFLOW_USE_INITIAL_FLOW
+        size, flags = (self._window_px, self._window_px), cv2.OPTFLOW_USE_INITIAL_FLOW
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
-        to, ok, _ = cv2.calcOpticalFlowPyrLK(
+        to, ok, left = cv2.calcOpticalFlowPyrLK(
             a, b, px, guess.copy(), None, None, winSize=size, maxLevel=c.levels, criteria=stop, flags=flags
         )
-        back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
-            b, a, to, px.copy(), None, None, winSize=size, maxLevel=0, criteria=stop, flags=flags
-        )
+        back, ok_back, gradient2 = cv2.calcOpticalFlowPyrLK(
+            b, a, to, px.copy(), None, None, winSize=size, maxLevel=0, criteria=stop,
+            flags=flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
+        )  # fmt: skip
         away = np.linalg.norm(np.asarray(back) - px, axis=1)
         good = (np.asarray(ok).ravel() > 0) & (np.asarray(ok_back).ravel() > 0) & (away < c.back_px)
-        return np.asarray(to, np.float32), good
+        noise = np.ones(len(px))
+        if good.any():
+            gradient = np.sqrt(np.maximum(np.asarray(gradient2, np.float64).ravel()[good], LEAST_GRADIENT2))
+            noise[good] = np.asarray(left, np.float64).ravel()[good] / gradient
+            noise[good] = np.maximum(noise[good], LEAST_NOISE * max(float(np.median(noise[good])), LEAST_GRADIENT2))
+        return np.asarray(to, np.float32), good, noise
 
     def _new_corners(self, image: Bytes, tracks: Tracks) -> ArrayF32:
         """(M, 2) px of corners where no track is, the best first."""
@@ -265,7 +292,7 @@ class KltTracker:
         inv_depth = self._expected_inv_depth(tracks)
         guess, seen = self.right.camera.project(tracks.ray @ T.R.T + (inv_depth * tracks.ray[:, 2])[:, None] * T.t)
         start = np.where(seen[:, None], guess, tracks.px).astype(np.float32)
-        px, found = self._flow(left, self._equalized(right), tracks.px, start)
+        px, found, patch = self._flow(left, self._equalized(right), tracks.px, start)
         found &= self.right.camera.inside(px.astype(np.float64), 1.0)
         ray, real = self.right.camera.unproject(px.astype(np.float64))
         rows = np.flatnonzero(found & real)
@@ -274,15 +301,16 @@ class KltTracker:
             SE3.identity(), tracks.ray[rows], sigma, T.inverse(), ray[rows], sigma, max_relative_sigma=math.inf
         )
         rows, z = rows[good], xyz[good, 2]
-        noise = epipolar_noise(tracks.ray[rows], ray[rows], np.ascontiguousarray(T.R), T.t / np.linalg.norm(T.t))
-        px_right, measured, sigmas = np.full_like(tracks.px, np.nan), np.zeros(len(tracks)), np.zeros(len(tracks))
+        along = T.t / np.linalg.norm(T.t)
+        rad = epipolar_noise(tracks.ray[rows], ray[rows], np.ascontiguousarray(T.R), along, patch[rows])
+        px_right, right_px = np.full_like(tracks.px, np.nan), np.zeros(len(tracks))
+        measured, sigmas = np.zeros(len(tracks)), np.zeros(len(tracks))
         px_right[rows] = px[rows]
         measured[rows] = 1.0 / z
         # a pixel of disparity is focal length times baseline of inverse depth
         sigmas[rows] = math.sqrt(2.0) * self.config.sigma_px / (self.camera.focal_px * float(np.linalg.norm(T.t)))
-        right_px = math.hypot(
-            self.config.wander * _noise_px(noise, self.camera, self.config.sigma_px), self.config.lens_px
-        )
+        own_px = self._scaled(patch[rows], rad * self.camera.focal_px)
+        right_px[rows] = np.hypot(self.config.wander * own_px, self._lens_px)
         return replace(tracks, px_right=px_right, inv_depth=measured, sigma_inv_depth=sigmas, right_px=right_px)
 
     def _expected_inv_depth(self, tracks: Tracks) -> Array:
@@ -296,10 +324,6 @@ class KltTracker:
         known = last.inv_depth[row_last] > 0
         out[row[known]] = last.inv_depth[row_last[known]]
         return out
-
-
-def _noise_px(angle: float, camera: Camera, usual: float) -> float:
-    return max(angle * camera.focal_px, LEAST_STEP_PX) if math.isfinite(angle) else usual
 
 
 def _check_size(image: Bytes, spec: CameraSpec) -> None:
@@ -316,11 +340,14 @@ def _with_new(old: Tracks, fresh: ArrayF32, camera: Camera, first_id: int) -> Tr
     ray, real = camera.unproject(fresh.astype(np.float64))
     fresh, ray = fresh[real], ray[real]
     n = len(fresh)
+    step_px = float(np.median(old.step_px)) if len(old) else LEAST_STEP_PX
     return replace(
         old, id=np.concatenate([old.id, np.arange(first_id, first_id + n)]),
         age=np.concatenate([old.age, np.zeros(n, np.int32)]), px=np.concatenate([old.px, fresh]),
         ray=np.concatenate([old.ray, ray]), px_right=np.full((len(old) + n, 2), np.nan, np.float32),
         inv_depth=np.zeros(len(old) + n), sigma_inv_depth=np.zeros(len(old) + n),
+        step_px=np.concatenate([old.step_px, np.full(n, step_px)]), right_px=np.zeros(len(old) + n),
+        wander_px2=np.concatenate([old.wander_px2, np.zeros(n)]),
     )  # fmt: skip
 
 

@@ -81,16 +81,16 @@ def fit_two_view(
 
 
 @kernel
-def epipolar_noise(ray_a: Array, ray_b: Array, R_b_a: Array, t: Array) -> float:
-    """Deviation, rad, of rays (N, 3) of two views out of their epipolar planes: 1.48 times the median, so that wrong
-    ones have no say. NaN for fewer than MIN_PAIRS."""
+def epipolar_noise(ray_a: Array, ray_b: Array, R_b_a: Array, t: Array, unit: Array) -> float:
+    """Deviation, rad, of rays (N, 3) of two views out of their epipolar planes, in units (N,) of their own: 1.48 times
+    the median, so that wrong ones have no say. NaN for fewer than MIN_PAIRS."""
     n, count = len(ray_a), 0
     g, normal, e = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
     _normals(ray_a, ray_b, R_b_a, g, normal)
     for k in range(n):
         x, y, z = t[1] * g[k, 2] - t[2] * g[k, 1], t[2] * g[k, 0] - t[0] * g[k, 2], t[0] * g[k, 1] - t[1] * g[k, 0]
         if x * x + y * y + z * z > NEAR_BASELINE * NEAR_BASELINE:
-            e[count] = abs(_angle(t, g[k], normal[k]))
+            e[count] = abs(_angle(t, g[k], normal[k])) / unit[k]
             count += 1
     return 1.4826 * float(np.median(e[:count])) if count >= MIN_PAIRS else math.nan
 

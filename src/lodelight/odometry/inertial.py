@@ -259,13 +259,13 @@ class InertialOdometry:
         if m:  # what two cameras say is said by their pixels
             inv_depth, sigma = np.zeros(n), np.zeros(n)
         none = np.zeros(m)
-        noise = np.concatenate([np.full(n, tracks.step_px), np.full(m, tracks.right_px)])
+        noise = np.concatenate([tracks.step_px, tracks.right_px[right]])
         return Observations(
             np.concatenate([tracks.id, tracks.id[right]]),
             np.concatenate([np.zeros(n, np.int32), np.ones(m, np.int32)]),
             np.concatenate([tracks.px, tracks.px_right[right]]).astype(np.float64),
             noise, np.concatenate([inv_depth, none]), np.concatenate([sigma, none]),
-            wander_px2=np.full(n + m, tracks.wander_px2),
+            wander_px2=np.concatenate([tracks.wander_px2, tracks.wander_px2[right]]),
         )  # fmt: skip
 
     def _keyframe_reason(self, tracks: Tracks, T_map_body: SE3) -> str:
