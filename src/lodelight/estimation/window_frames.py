@@ -19,6 +19,9 @@ from lodelight.types import AnyArray, Array, Bools, Ints
 COLUMNS = ("track", "camera", "px", "sigma_px", "inv_depth", "sigma_inv_depth", "shift_s", "rays", "wander_px2")
 
 LEAST_STEP_PX2 = 0.02**2  # of a track from one frame to another
+# Correlation of a track's errors in the second camera, frames of a window apart (docs/inertial.md): as much of each
+# counts once, however often it is seen.
+ALIKE = 0.5
 
 
 @dataclass(eq=False)
@@ -169,6 +172,9 @@ def gathered(frames: Sequence[WindowFrame]) -> tuple[Sightings, Ints, Ints]:
     followed = (before >= 0) & (sorted_columns["camera"] == 0)
     step2 = wander[followed] - wander[before[followed]]
     sorted_columns["sigma_px"][followed] = np.sqrt(np.maximum(step2, LEAST_STEP_PX2))
+    across = (before >= 0) & ~followed
+    times = np.repeat(np.add.reduceat(across, start[:-1]) if len(across) else np.zeros(0, int), np.diff(start))
+    sorted_columns["sigma_px"][across] *= np.sqrt(1.0 + ALIKE * (times[across] - 1))
     return (
         Sightings(track=track[starts[enough]], start=start, frame=frame[order], before=before, **sorted_columns),
         frame[order],

@@ -150,7 +150,8 @@ def visual_terms(
     most = 1
     for m in range(len(start) - 1):
         most = max(most, start[m + 1] - start[m])
-    r_all, J_all, good = np.zeros((most, 3)), np.zeros((most, 3, 28)), np.zeros(most, np.bool_)
+    r_all, r_row, J_all = np.zeros((most, 3)), np.zeros((most, 3)), np.zeros((most, 3, 28))
+    good, n_rows, weights = np.zeros(most, np.bool_), np.zeros(most, np.int64), np.zeros(most)
     r, E, r_own, J_own = np.zeros(3), np.empty((2, 3)), np.zeros(3), np.empty((3, 27))
     compact, weighted, J_landmark = np.zeros((3, 48)), np.zeros((3, 48)), np.empty((3, 3))
     bases, widths = np.empty(8, np.int32), np.empty(8, np.int32)
@@ -172,69 +173,92 @@ def visual_terms(
             place[a] = landmark[m, a]
             for b in range(3):
                 here[a, b] = base[m, a, b]
+        total = total_comparable = 0.0
+        measured = -3
         for o in range(first, start[m + 1]):
             k, back = o - first, before_row[o] - first
             j, cj = frame[o], camera[o]
-            tau_j = offset_s + shift_s[o]
-            load_pose(x, j, motion, tau_j, Rj, pj)
-            load_pose(lin, j, motion, tau_j, Lj, lj)
+            load_pose(x, j, motion, offset_s + shift_s[o], Rj, pj)
             load_pose(mount, cj, still, 0.0, Rcj, pcj)
-            load_pose(mount_lin, cj, still, 0.0, Lcj, lcj)
             for a in range(len(lens)):
                 lens[a] = params[cj, a]
             rows = inverse_depth_residual(
                 models[cj], lens, Ri, pi, Rci, pci, Rj, pj, Rcj, pcj, here, place,
                 px[o, 0], px[o, 1], 1.0, inv_depth[o], sigma_inv_depth[o], r_own,
             )  # fmt: skip
-            if normal and rows > 0 and not inverse_depth_jacobian(
-                models[cj], lens, Li, li, Lci, lci, Lj, lj, Lcj, lcj, here, place,
-                1.0, inv_depth[o], sigma_inv_depth[o], E, J_own,
-            ):  # fmt: skip
-                rows = 0
             good[k] = rows > 0
             if rows > 0:
                 for row in range(3):
                     r_all[k, row] = r_own[row]
-            if normal and rows > 0:
-                if j != anchor and tau_i != 0.0:
-                    _turned_back(J_own, 0, motion, anchor, tau_i)
-                if j != anchor and tau_j != 0.0:
-                    _turned_back(J_own, 6, motion, j, tau_j)
-                for row in range(3):
-                    for a in range(27):
-                        J_all[k, row, a] = J_own[row, a]
-                if offset_at >= 0:
-                    for row in range(3):
-                        s = 0.0
-                        for a in range(3):
-                            s += J_own[row, a] * motion[anchor, a] + J_own[row, 3 + a] * motion[anchor, 3 + a]
-                            s += J_own[row, 6 + a] * motion[j, a] + J_own[row, 9 + a] * motion[j, 3 + a]
-                        J_all[k, row, 27] = s
             if before_row[o] >= 0 and not good[back]:
                 rows = 0
-            value = weight = 0.0
+            n_rows[k] = rows
             bound = CHI2_PX_DEPTH if inv_depth[o] > 0.0 else CHI2_PX
-            scale = 1.0 / sigma_px[o]
-            if rows > 0:
-                r[0], r[1], r[2] = scale * r_all[k, 0], scale * r_all[k, 1], r_all[k, 2]
-                if before_row[o] >= 0:
-                    r[0] -= scale * r_all[back, 0]
-                    r[1] -= scale * r_all[back, 1]
-                chi2[o] = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-                value, weight = fading(chi2[o], bound) if robust else (chi2[o], 1.0)
-            else:
+            weights[k] = 0.0
+            if rows == 0:
                 chi2[o] = math.inf
+                if active[o] and before[o] < math.inf:
+                    total_comparable += fading(before[o], bound)[0] if robust else before[o]
+                continue
+            scale = 1.0 / sigma_px[o]
+            r_row[k, 0], r_row[k, 1], r_row[k, 2] = scale * r_all[k, 0], scale * r_all[k, 1], r_all[k, 2]
+            if before_row[o] >= 0:
+                r_row[k, 0] -= scale * r_all[back, 0]
+                r_row[k, 1] -= scale * r_all[back, 1]
+            was = before[o]
+            chi2[o] = r_row[k, 0] ** 2 + r_row[k, 1] ** 2 + r_row[k, 2] ** 2
             if not active[o]:
                 continue
-            if rows == 0:
-                if before[o] < math.inf:
-                    comparable += fading(before[o], bound)[0] if robust else before[o]
+            value, weights[k] = fading(chi2[o], bound) if robust else (chi2[o], 1.0)
+            total += value
+            measured += rows
+            if was < math.inf:
+                total_comparable += value
+        whole = 1.0
+        if robust and measured > 0:
+            # 95 % of a chi-square distribution, by Wilson and Hilferty
+            spread = 2.0 / (9.0 * measured)
+            bound = measured * (1.0 - spread + 1.645 * math.sqrt(spread)) ** 3
+            total, whole = fading(total, bound)
+            total_comparable = fading(total_comparable, bound)[0]
+        cost += total
+        comparable += total_comparable
+        for o in range(first, start[m + 1] if normal else first):
+            k, back = o - first, before_row[o] - first
+            if not good[k]:
                 continue
-            cost += value
-            if before[o] < math.inf:
-                comparable += value
-            if not normal:
+            j, cj = frame[o], camera[o]
+            tau_j = offset_s + shift_s[o]
+            load_pose(lin, j, motion, tau_j, Lj, lj)
+            load_pose(mount_lin, cj, still, 0.0, Lcj, lcj)
+            for a in range(len(lens)):
+                lens[a] = params[cj, a]
+            good[k] = inverse_depth_jacobian(
+                models[cj], lens, Li, li, Lci, lci, Lj, lj, Lcj, lcj, here, place,
+                1.0, inv_depth[o], sigma_inv_depth[o], E, J_own,
+            )  # fmt: skip
+            if not good[k]:
                 continue
+            if j != anchor and tau_i != 0.0:
+                _turned_back(J_own, 0, motion, anchor, tau_i)
+            if j != anchor and tau_j != 0.0:
+                _turned_back(J_own, 6, motion, j, tau_j)
+            for row in range(3):
+                for a in range(27):
+                    J_all[k, row, a] = J_own[row, a]
+            if offset_at >= 0:
+                for row in range(3):
+                    s = 0.0
+                    for a in range(3):
+                        s += J_own[row, a] * motion[anchor, a] + J_own[row, 3 + a] * motion[anchor, 3 + a]
+                        s += J_own[row, 6 + a] * motion[j, a] + J_own[row, 9 + a] * motion[j, 3 + a]
+                    J_all[k, row, 27] = s
+            weight, rows = whole * weights[k], n_rows[k]
+            if weight == 0.0 or (before_row[o] >= 0 and not good[back]):
+                continue
+            scale = 1.0 / sigma_px[o]
+            for row in range(3):
+                r[row] = r_row[k, row]
             for row in range(3):
                 for a in range(3):
                     J_landmark[row, a] = J_all[k, row, 12 + a]
@@ -246,7 +270,7 @@ def visual_terms(
                     for a in range(3):
                         J_landmark[row, a] -= J_all[back, row, 12 + a]
                 n = _add_sighting(
-                    J_all[back], -1.0, frame[o - k + back], anchor, camera[o - k + back], ci, pose_at, mount_at,
+                    J_all[back], -1.0, frame[first + back], anchor, camera[first + back], ci, pose_at, mount_at,
                     offset_at, compact, bases, widths, n,
                 )  # fmt: skip
             for row in range(2):
