@@ -33,6 +33,7 @@ ENOUGH_VOTES = 30  # matches with the map, from which its own covisibility says 
 NOISES = (1.0, 1.4, 2.0)  # of a frame over a sharp one's, at which right matches are told from wrong ones
 ENOUGH_MEASURED, OPEN_M = 10, 0.03  # points whose distance is known do without others if so many, and so exact
 MOST_DECIDING = 5  # points that decide a pose alone, in one frame
+CLOSER = 2.0  # windows, where in those before most matches were by chance
 NEAR_M, NEAR_DEG, NEAREST = 8.0, 60.0, 20  # else keyframes from so near, turned by so little, at most so many
 
 
@@ -91,6 +92,8 @@ class Follower(Tracker):
         """As `Tracker.refine`, in the current map; point : (N,) matches so far, of both kinds.
 
         map_alone : without temporary points
+        Where most matches with the map are by chance, they hold the pose off and take corners from temporary points:
+        it is had without them if more agree so, and from there all is matched once more in closer windows.
         """
         map = self.map
         voting = self._around(T_world_body, point)
@@ -107,9 +110,15 @@ class Follower(Tracker):
             carried = self._matched(around, self.temporary.table.desc[around.point], carried, free, index, search)
         posed = partial(self._posed, t_ns, seen, T_world_body, reference=int(voting[0]), window=NARROW * search)
         tracked = posed(mapped, carried)
-        if tracked.right_in_map < MAJORITY * tracked.n_inliers and np.any(carried >= 0):  # by chance, for the most part
-            mapped = np.full(len(seen), -1, np.int32)
-            tracked = posed(mapped, carried)
+        if tracked.right_in_map < MAJORITY * tracked.n_inliers:
+            nothing = np.full(len(seen), -1, np.int32)
+            if np.any(carried >= 0):
+                without = posed(nothing, carried)
+                if without.right_in_all >= tracked.right_in_all:
+                    mapped, tracked = nothing, without
+            if search > CLOSER and not map_alone:
+                alone = np.where(carried >= 0, FIRST_TEMPORARY - carried, -1).astype(np.int32)
+                return self.refine(t_ns, seen, tracked.T_world_body, alone, index, CLOSER)
         if np.any(carried >= 0) and _is_open(tracked):
             tracked = posed(mapped, carried, guess=True)
         if use_overlay:
