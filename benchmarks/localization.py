@@ -65,10 +65,11 @@ class Query:
         self.estimates: list[Estimate] = []
         self.ms: list[float] = []
         for frame in frames:
-            start = time.thread_time()
+            start, n_events = time.thread_time(), len(self.events)
             estimate = self.localizer.feed(Frame(frame.t_ns, frame.images[:1]) if isinstance(frame, Frame) else frame)
             if estimate is not None:
-                if estimate.status in ("tracking", "degraded"):
+                went_back = any(event["kind"] == "followed_back" for event in self.events[n_events:])
+                if estimate.status in ("tracking", "degraded") and not went_back:
                     self.ms.append(1e3 * (time.thread_time() - start))
                 self.estimates.append(estimate)
         self.localizer.close()

@@ -299,16 +299,15 @@ def test_frames_before_a_camera_was_found_are_followed_back_from_there():
     def begun(rig):
         return Ladder(rig, map, ORB, LadderConfig(), 0, True, False, lambda *_, **__: None)
 
-    ladder, backwards, rng = begun(OTHER), Backwards(OTHER, begun), np.random.default_rng(8)
+    ladder, backwards, rng = begun(OTHER), Backwards(OTHER, begun, 90), np.random.default_rng(8)
     true = {i * S // 10: walk(x, 0.3 * np.sin(0.4 * x), 0.0) for i, x in enumerate(np.arange(5.0, 14.0, 0.08))}
     for t_ns, T_world_body in true.items():
         seen, _ = now.seen(OTHER, T_world_body, rng)
-        if T_world_body.t[0] > 12.0 and not (tracked := ladder.locate(t_ns, seen)).why_lost:
+        tracked = ladder.locate(t_ns, seen if T_world_body.t[0] > 12.0 else seen.take(np.zeros(0, int)))
+        if poses := dict(backwards.add(tracked, seen)):
             break
-        backwards.wait(t_ns, seen)
-    poses = dict(backwards.follow(tracked))
     assert len(poses) >= 0.9 * t_ns / (S // 10)
     assert max(np.linalg.norm(T.t - true[t].t) for t, T in poses.items()) < 0.1
     assert backwards.created > 0
     assert backwards.left == 0
-    assert backwards.follow(tracked) == []
+    assert backwards.follow() == []

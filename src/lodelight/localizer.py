@@ -10,7 +10,6 @@ import numpy as np
 
 from lodelight.compiled import Stopwatch
 from lodelight.errors import CalibrationError, MapError
-from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3, carried_covariance
@@ -84,7 +83,9 @@ class Localizer:
             rig, map, self.config.orb, self.config.ladder, self.config.seed, self.config.temporary_points, live,
             self._emit, DeadReckoning(rig.imu, self._emit) if inertial and rig.imu is not None else None,
         )  # fmt: skip
-        self.backwards = Backwards(rig, self._another_ladder) if self.config.backwards and not live else None
+        self.backwards: Backwards | None = None
+        if self.config.backwards and not live:
+            self.backwards = Backwards(rig, self._another_ladder, self.config.ladder.states.good_inliers)
         self._earlier: dict[int, SE3] = {}
         self.relocalizations = 0
         self.dropped = 0
@@ -127,7 +128,7 @@ class Localizer:
         self.relocalizations += self.ladder.status == "relocalized"
         track_ms = clock.ms()
         if self.backwards is not None:
-            self._look_back(self.backwards, tracked, seen)
+            self._keep_earlier(self.backwards.add(tracked, seen))
         details = {
             "temporary": float(n_temporary(tracked)),
             "mono": float(self.ladder.states.state is State.carried),
@@ -140,6 +141,8 @@ class Localizer:
 
     def close(self) -> None:
         """Wait for what runs beside, and clear what is temporary."""
+        if self.backwards is not None:
+            self._keep_earlier(self.backwards.follow())
         self.ladder.close()
 
     @property
@@ -148,13 +151,10 @@ class Localizer:
         those believed only after others had agreed, and those followed back from where the camera was found."""
         return sorted({**self._earlier, **dict(self.ladder.confirmed)}.items())
 
-    def _look_back(self, backwards: Backwards, tracked: Tracked, seen: Features) -> None:
-        """A frame without a pose waits for one that has a pose, and that one leads back to those that wait."""
-        if tracked.why_lost:
-            backwards.wait(tracked.t_ns, seen)
-        elif poses := backwards.follow(tracked):
-            self._earlier.update(poses)
-            self._emit(tracked.t_ns, "followed_back", frames=len(poses), first_t_ns=poses[-1][0])
+    def _keep_earlier(self, poses: list[tuple[int, SE3]]) -> None:
+        self._earlier.update(poses)
+        if poses:
+            self._emit(poses[0][0], "followed_back", frames=len(poses), first_t_ns=poses[-1][0])
 
     def _another_ladder(self, rig: Rig) -> Ladder:
         """A ladder at its beginning in the same map, of which nobody is told."""

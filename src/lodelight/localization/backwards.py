@@ -18,39 +18,55 @@ from lodelight.localization.tracked import Tracked
 from lodelight.rig import Rig
 
 MOST = 600  # frames that wait, the latest; some 90 kB each
+RUNWAY = 10  # frames after the one that was found, on which temporary points are made before the way back leaves them
 
 
 class Backwards:
     """Frames that wait until the camera is found, and the way back through them.
 
+    The frame in which it is found shows barely enough; a few later, or where the map holds the camera, it turns round.
     begin : makes a ladder for a rig, at its beginning
+    good_inliers : points of the map above which it holds a camera
     created, left : temporary points that were made on the way, and those left in the end
     """
 
-    def __init__(self, rig: Rig, begin: Callable[[Rig], Ladder]) -> None:
+    def __init__(self, rig: Rig, begin: Callable[[Rig], Ladder], good_inliers: int) -> None:
         self._begin = begin
         self._rig = mirrored(rig)
-        self._waiting: deque[tuple[int, Features]] = deque(maxlen=MOST)
+        self._good_inliers = good_inliers
+        self._waiting: deque[tuple[int, Features, bool]] = deque(maxlen=MOST)  # whether it has a pose, too
+        self._known: list[Tracked] = []  # frames since the camera was found
         self.created = self.left = 0
 
-    def wait(self, t_ns: int, seen: Features) -> None:
-        """A frame that has no pose yet."""
-        self._waiting.append((t_ns, seen))
+    def add(self, tracked: Tracked, seen: Features) -> list[tuple[int, SE3]]:
+        """The next frame, and `seen` as the camera saw it; returns what `follow` does where it turns round here."""
+        poses: list[tuple[int, SE3]] = []
+        if tracked.why_lost:
+            poses = self.follow()
+        elif not self._waiting:
+            return poses
+        else:
+            self._known.append(tracked)
+        self._waiting.append((tracked.t_ns, seen, not tracked.why_lost))
+        held = not tracked.why_lost and tracked.right_in_map >= self._good_inliers
+        return self.follow() if held or len(self._known) > RUNWAY else poses
 
-    def follow(self, found: Tracked) -> list[tuple[int, SE3]]:
-        """(t_ns, T_world_body) of frames that waited, as far as the camera can be followed back from where it was
-        found, the latest first. None waits any more."""
-        waiting, poses = list(self._waiting), []
-        self._waiting.clear()
-        if not waiting:
+    def follow(self) -> list[tuple[int, SE3]]:
+        """(t_ns, T_world_body) of frames that waited, as far as the camera can be followed back from the last one that
+        has a pose, the latest first. None waits any more; nothing where the camera was not found since."""
+        if not self._known:
             return []
+        found, waiting = self._known[-1], list(self._waiting)
+        poses: list[tuple[int, SE3]] = []
+        self._known.clear()
+        self._waiting.clear()
         ladder = self._begin(self._rig)
         ladder.start(replace(found, temporary=None))
-        for t_ns, seen in reversed(waiting):
+        for t_ns, seen, known in reversed(waiting[:-1]):
             tracked = ladder.locate(2 * found.t_ns - t_ns, seen)
             if ladder.states.state is State.searching:
                 break
-            if not tracked.why_lost:
+            if not (tracked.why_lost or known):
                 poses.append((t_ns, tracked.T_world_body))
         ladder.close()
         self.created += ladder.temporary.created
