@@ -318,9 +318,11 @@ def state_terms(
     x: Array, lin: Array, measured: Array, whiten: Array, use: Bools, still_sigma: Array,
     still_sigma_m: float,
     prior_at: Ints, prior_H: Array, prior_g: Array, delta: Array,
-    pose_at: int, H: Array, g: Array,
+    pose_at: int, normal: bool, H: Array, g: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """Add the IMU between frames, standstill and the prior; returns their cost, and that of the IMU alone.
+
+    normal False : H and g are not wanted
 
     measured (F - 1, 76), whiten (F - 1, 15, 15) : L^-1 of the covariance's factor; use (F - 1,)
     still_sigma (F,) m/s : of a velocity of zero, 0 = moving; still_sigma_m : of the way between two such frames
@@ -334,6 +336,13 @@ def state_terms(
         if not use[k]:
             continue
         inertial_residual(x[k], x[k + 1], measured[k], r)
+        for a in range(15):
+            white_r[a] = 0.0
+            for b in range(a + 1):
+                white_r[a] += whiten[k, a, b] * r[b]
+            cost += white_r[a] * white_r[a]
+        if not normal:
+            continue
         inertial_residual(lin[k], lin[k + 1], measured[k], r_lin)
         inertial_jacobian(lin[k], lin[k + 1], measured[k], r_lin, J)
         for s in range(2):
@@ -343,13 +352,10 @@ def state_terms(
                 column[15 * s + 6 + a] = 9 * (k + s) + a
         white[:] = 0.0
         for a in range(15):
-            white_r[a] = 0.0
             for b in range(a + 1):
                 scale = whiten[k, a, b]
-                white_r[a] += scale * r[b]
                 for c in range(30):
                     white[a, c] += scale * J[b, c]
-            cost += white_r[a] * white_r[a]
         for a in range(15):
             for c in range(30):
                 scale = white[a, c]
@@ -384,7 +390,7 @@ def state_terms(
         pull = 0.0
         for j in range(q):
             pull += prior_H[i, j] * delta[j]
-            if prior_at[j] >= prior_at[i]:
+            if normal and prior_at[j] >= prior_at[i]:
                 H[prior_at[i], prior_at[j]] += prior_H[i, j]
         g[prior_at[i]] += prior_g[i] + pull
         cost += delta[i] * (pull + 2.0 * prior_g[i])

@@ -228,8 +228,9 @@ class Problem:
         """Fill `out`. before (N,) : chi-squares of a state that its `comparable` is to be compared with; normal False :
         only costs and chi-squares are wanted."""
         s, t = self.sightings, self.tag_sightings
-        out.H[:] = 0.0
-        out.g[:] = 0.0
+        if normal:
+            out.H[:] = 0.0
+            out.g[:] = 0.0
         frames, tags, mounts = x.frames, x.tags, x.mounts
         if self.first_estimates:
             frames, tags = self.lin_frames(x), self.lin_tags(x)
@@ -245,7 +246,7 @@ class Problem:
         delta = self.offsets(x)[self.prior_at]
         rest, out.imu_chi2 = kernels.state_terms(
             x.frames, frames, self.measured, self.whiten, self.use_imu, self.still_sigma, self.still_sigma_m,
-            self.prior_at, self.prior.H, self.prior.g, delta, self.pose_at, out.H, out.g,
+            self.prior_at, self.prior.H, self.prior.g, delta, self.pose_at, normal, out.H, out.g,
         )  # fmt: skip
         if len(t.frame):
             rest += kernels.tag_terms(
@@ -256,10 +257,12 @@ class Problem:
         for key, belief in self.beliefs.items():
             at, d = self.columns(key), self._from_mean(key, belief.mean, x)
             pull = belief.information @ d
-            out.H[np.ix_(at, at)] += belief.information
-            out.g[at] += pull
+            if normal:
+                out.H[np.ix_(at, at)] += belief.information
+                out.g[at] += pull
             rest += float(d @ pull)
-        out.H[np.arange(self.n), np.arange(self.n)] += NO_COVARIANCE
+        if normal:
+            out.H[np.arange(self.n), np.arange(self.n)] += NO_COVARIANCE
         out.cost += rest
         out.comparable += rest
 

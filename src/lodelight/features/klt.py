@@ -368,10 +368,14 @@ def best_corners(
         _cover(taken, x, y, apart)
     best, u, v = np.zeros(columns * rows, np.float32), np.zeros(columns * rows), np.zeros(columns * rows)
     margin = 6
+    column = np.empty(width, np.int64)
+    for x in range(width):
+        column[x] = int(x / cell)
     for y in range(margin, height - margin):
+        row = int(y / cell) * columns
         for x in range(margin, width - margin):
             s = score[y, x]
-            at = int(y / cell) * columns + int(x / cell)
+            at = row + column[x]
             if s <= best[at] or taken[y, x]:
                 continue
             if (

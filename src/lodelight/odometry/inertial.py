@@ -175,7 +175,9 @@ class InertialOdometry:
         )  # fmt: skip
         reason = self._keyframe_reason(tracks, predicted.T_world_body)
         reason = reason or (f"first sight of {new[0]}" if new else "")
-        window.add_frame(frame.t_ns, imu, self._observations(tracks), views, bool(reason), self._still(imu))
+        window.add_frame(
+            frame.t_ns, imu, self._observations(tracks), views, bool(reason), self._still(imu), guess=predicted
+        )
         solution = window.solve()
         used = {seen.view.id for seen in window.frames[-1].tags if seen.use}
         self._judge_tags(tags, solution)
