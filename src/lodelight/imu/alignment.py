@@ -102,6 +102,7 @@ class Alignment:
     sigma_tilt rad : of gravity's direction; path_m : farthest from the first position
     rms : of the angles that agree, in units of the noise; inliers, n : rays that agree, of so many
     behind : share of the landmarks that came to lie behind the cameras in the linear step
+    chi2 : robust, of everything, in units of the noise
     """
 
     gravity: Array
@@ -120,6 +121,7 @@ class Alignment:
     inliers: int
     n: int
     behind: float
+    chi2: float = 0.0
 
 
 def align(
@@ -284,7 +286,7 @@ class _Problem:
             sigma_velocity=math.sqrt(max(np.linalg.eigvalsh(J_v @ covariance @ J_v.T)[-1], 0.0)),
             sigma_scale=math.sqrt(max(along @ J_p @ covariance @ J_p.T @ along, 0.0)) / max(path, 1e-9),
             sigma_tilt=math.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)),
-            path_m=path, rms=rms, inliers=by.inliers, n=len(self.rows.frame), behind=behind,
+            path_m=path, rms=rms, inliers=by.inliers, n=len(self.rows.frame), behind=behind, chi2=by.cost,
         )  # fmt: skip
 
     def _sensitivity(self, k: int, tangent: Array) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ from lodelight.types import AnyArray, Array
 
 GRAVITY_M_S2 = 9.81
 ALIGNED_VIEWS = 12
+SIGN_CHI2 = 16.0  # by so much must the accelerometer's turned sign fit better
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class Starter:
         self.T_body_cam = list(T_body_cam)
         self.focal_px = focal_px
         self.metric = metric
+        self.doubted = False  # images and IMU were found to contradict each other
         self.views: list[StartView] = []
         self.imu: list[ImuSamples] = []  # imu[i] from views[i] to views[i + 1]
 
@@ -240,8 +242,8 @@ class Starter:
             return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
         sigma_ray = c.sigma_px / self.focal_px
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray, (0.2 * c.bias_gyro, c.bias_accel))
-        if found == BEHIND and suspicious and parallax >= c.min_parallax_deg:
-            self._refuse_turned_sign(rows, sigma_ray, bias)
+        if suspicious and parallax >= c.min_parallax_deg and (found == BEHIND or self.doubted):
+            self._refuse_turned_sign(rows, sigma_ray, bias, found)
         if isinstance(found, str):
             return found
         missing = self._missing(found, motions)
@@ -351,14 +353,17 @@ class Starter:
         ]
         return next((text.format(value, most) for value, most, text in shares if not value < most), "")
 
-    def _refuse_turned_sign(self, rows: Rows, sigma_ray: float, bias: Array) -> None:
-        """Raise SourceError if everything fits with the accelerometer's sign turned."""
+    def _refuse_turned_sign(self, rows: Rows, sigma_ray: float, bias: Array, as_it_is: Alignment | str) -> None:
+        """Raise SourceError if with the accelerometer's sign turned all fits as well as a start must, and clearly
+        better than `as_it_is`."""
         imu = self.imu
         self.imu = [ImuSamples(s.t_ns, s.gyro, -s.accel) for s in imu]
         motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
         self.imu = imu
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray)
-        if isinstance(found, Alignment) and found.inliers > 0.8 * found.n and found.behind < 0.2:
+        if not isinstance(found, Alignment) or found.behind > 0.2 or self._missing(found, motions):
+            return
+        if isinstance(as_it_is, str) or found.chi2 + SIGN_CHI2 < as_it_is.chi2:
             raise SourceError(
                 "the accelerometer's sign is turned: images and IMU agree if it is negated (at rest it must read "
                 "+9.81 m/s^2 upwards); negate it in the recording"

@@ -31,6 +31,7 @@ from lodelight.tags.gate import KnownTag
 from lodelight.types import Array
 
 EventSink = Callable[..., None]
+CONTRADICTION = "images and IMU contradict each other"
 UNKNOWN_15 = np.diag(np.repeat([math.pi**2, 1e6, 1e4, 1.0, 10.0], 3))
 
 
@@ -400,7 +401,7 @@ class InertialOdometry:
         if not (gyro < c.most_bias_gyro and accel < c.most_bias_accel):
             return f"the window believes in biases of {gyro:.2f} rad/s and {accel:.2f} m/s^2"
         if not solution.imu_chi2 < c.most_imu_chi2:
-            return f"images and IMU contradict each other (chi-square {solution.imu_chi2:.1f} per degree of freedom)"
+            return f"{CONTRADICTION} (chi-square {solution.imu_chi2:.1f} per degree of freedom)"
         return ""
 
     def _blind(self, inliers: int, t_ns: int) -> str:
@@ -421,6 +422,7 @@ class InertialOdometry:
         self._tag_start.refused |= set() if self._check is None else set(self._check.sizes)  # it may be their fault
         self.window, self._keyframe, self._blind_since, self._check = None, None, None, None
         self.restarts += 1
+        self.starter.doubted |= CONTRADICTION in why
         self.starter.reset()
         self._views = []
         self.tracker.reset()

@@ -173,8 +173,9 @@ def _events(run: RunFolder) -> tuple[list[dict[str, Any]], str]:
                 k: v for k, v in event.items() if k not in ("t_ns", "kind", "inserted", "why") and v not in ("", None)
             }
             what = " · ".join([*filter(None, [event.get("why")]), *(f"{k} {_word(v)}" for k, v in rest.items())])
-            t_s = float(run.seconds(np.array(event["t_ns"], dtype=np.int64)))
-            rows.append((i, {"t_s": round(t_s, 3), "kind": kind, "what": what}))
+            t_ns = event["t_ns"]  # None of what a file has no stamp for
+            t_s = None if t_ns is None else round(float(run.seconds(np.array(t_ns, dtype=np.int64))), 3)
+            rows.append((i, {"t_s": t_s, "kind": kind, "what": what}))
     shown = f"Shown: {'; '.join(cut)}. " if cut else ""
     return [row for _, row in sorted(rows, key=lambda r: r[0])], f"{shown}All are in events.jsonl."
 

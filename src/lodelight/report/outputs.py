@@ -106,6 +106,9 @@ class Outputs:
             world, of which the live one then counts from the frame on that was)
         tags : as they were found; into `anchors.toml`, and their corners into the cloud
         """
+        if self._estimates and not self._estimates[-1].localized:  # what was missing to the end
+            last = self._estimates[-1]
+            self.event(last.t_ns, "state", before=last.status, now=last.status, why=last.why)
         self.close()
         localized = [e for e in self._estimates if e.localized]
         live = Trajectory.from_poses([e.t_ns for e in localized], [e.T_world_body for e in localized])

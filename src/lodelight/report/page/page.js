@@ -63,7 +63,7 @@ function listEvents(events) {
       !hidden.has(event.kind) && (event.kind + " " + event.what).toLowerCase().includes(wanted));
     body.replaceChildren(...rows.map((event) => {
       const row = document.createElement("tr");
-      for (const text of [event.t_s.toFixed(2), event.kind, event.what]) row.insertCell().textContent = text;
+      for (const text of [event.t_s === null ? "" : event.t_s.toFixed(2), event.kind, event.what]) row.insertCell().textContent = text;
       return row;
     }));
   }
