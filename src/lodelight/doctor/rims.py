@@ -21,6 +21,7 @@ BANDS_M = (0.0, 1.5, 2.5, 4.0, 8.0)
 PER_BAND, AT_LEAST = 400, 30  # rims looked at, of a band of one image
 REACH_RAD = 0.07  # so far they are looked for
 CLEAR = 5.0  # deviations by which the best place must stand out of all others
+RIVAL = 1.15  # and by so much more than the next best: shelves and bricks look alike a step aside
 BLOCKS = 6  # of a recording, each left out once
 PIXEL = 0.7  # to which a place is told, both axes together
 
@@ -68,7 +69,7 @@ def rims_of(image: Bytes, depth: ArrayF32, focal_px: float) -> list[Rims]:
 
 
 def beside(frames: list[list[Rims]]) -> Beside | None:
-    """What all images together show, None where their rims are too few to stand out."""
+    """What all images together show, None where rims stand out in fewer than two bands of distance."""
     block = np.arange(len(frames)) * BLOCKS // max(len(frames), 1)
     bands, px, distance_m, variance = [], [], [], []
     for band in range(len(BANDS_M) - 1):
@@ -82,7 +83,7 @@ def beside(frames: list[list[Rims]]) -> Beside | None:
         distance_m.append(found[2])
         variance.append(PIXEL**2 + (BLOCKS - 1) / BLOCKS * float(np.sum(moved**2)))
         bands.append((found[2], *found[:2]))
-    if not bands:
+    if len(bands) < 2:  # one alone has nothing that would contradict it
         return None
     weight = 1.0 / np.array(variance)
     x, y = np.average(np.array(px), axis=0, weights=weight).tolist()
@@ -120,7 +121,10 @@ def _found(frames: list[list[Rims]]) -> tuple[float, float, float] | None:
     middle = float(np.median(total))
     deviation = 1.48 * float(np.median(np.abs(total - middle)))
     y, x = np.unravel_index(int(np.argmax(total)), total.shape)
-    if total[y, x] - middle < CLEAR * deviation:
-        return None
     reach = total.shape[0] // 2
+    elsewhere = total.copy()
+    near = max(2, reach // 5)
+    elsewhere[max(y - near, 0) : y + near + 1, max(x - near, 0) : x + near + 1] = middle
+    if total[y, x] - middle < max(CLEAR * deviation, RIVAL * float(elsewhere.max() - middle)):
+        return None
     return float(reach - x), float(reach - y), float(count.sum() / np.sum(count / [r.distance_m for r in rims]))
