@@ -263,8 +263,9 @@ class KltTracker:
         good = (np.asarray(ok).ravel() > 0) & (np.asarray(ok_back).ravel() > 0) & (away < c.back_px)
         noise = np.ones(len(px))
         if good.any():
-            gradient = np.sqrt(np.maximum(np.asarray(gradient2, np.float64).ravel()[good], LEAST_GRADIENT2))
-            noise[good] = np.asarray(left, np.float64).ravel()[good] / gradient
+            # of lost tracks these may be anything
+            gradient = np.sqrt(np.maximum(np.asarray(gradient2).ravel()[good].astype(np.float64), LEAST_GRADIENT2))
+            noise[good] = np.asarray(left).ravel()[good].astype(np.float64) / gradient
             noise[good] = np.maximum(noise[good], LEAST_NOISE * max(float(np.median(noise[good])), LEAST_GRADIENT2))
         return np.asarray(to, np.float32), good, noise
 
