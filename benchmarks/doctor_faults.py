@@ -11,16 +11,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 
-import cv2
 import numpy as np
 
 from lodelight.doctor.examine import judge, look
 from lodelight.doctor.gather import RIMS_EVERY, Seen
 from lodelight.doctor.rims import Rims, rims_of
 from lodelight.geometry.cameras import Camera
+from lodelight.geometry.se3 import SE3
+from lodelight.geometry.so3 import so3_exp
 from lodelight.io import open_source
 from lodelight.io.recording import Recording
+from lodelight.io.registration import Registration
 from lodelight.messages import Imu
 from lodelight.rig import Rig
 
@@ -96,24 +99,12 @@ def faults(recording: Recording, seen: Seen, rng: np.random.Generator) -> dict[s
 
 def beside_the_image(recording: Recording, metres: float, degrees: float, rng: np.random.Generator) -> list[list[Rims]]:
     """Rims of a recording whose depth lies as by a sensor shifted and turned across its axis."""
-    lens = recording.rig.cameras[0].camera
-    angle = rng.uniform(0.0, 2.0 * np.pi)
-    across = np.array([np.cos(angle), np.sin(angle)])
-    out = []
-    for frame in list(recording.frames(1, True, 0.0, 24.0))[::RIMS_EVERY]:
-        if frame.depth is None:
-            continue
-        v, u = np.nonzero(np.nan_to_num(frame.depth) > 0)
-        z = frame.depth[v, u]
-        far_first = np.argsort(-z, kind="stable")
-        move = lens.focal_px * (np.radians(degrees) + metres / z[far_first, None]) * across
-        x, y = (np.stack([u, v], 1)[far_first] + np.rint(move)).astype(int).T
-        inside = (x >= 0) & (y >= 0) & (x < lens.width) & (y < lens.height)
-        depth = np.zeros_like(frame.depth)
-        depth[y[inside], x[inside]] = z[far_first][inside]
-        depth = np.where(depth == 0, cv2.medianBlur(depth, 3), depth)  # pixels that no reading fell on
-        out.append(rims_of(frame.images[0], depth, lens.focal_px))
-    return out
+    lens, angle = recording.rig.cameras[0].camera, rng.uniform(0.0, 2.0 * np.pi)
+    across = np.array([np.cos(angle), np.sin(angle), 0.0])
+    turn = so3_exp(np.radians(degrees) * np.array([-across[1], across[0], 0.0]))
+    moved = Registration(lens, lens, SE3(turn, metres * across))
+    frames = islice(recording.frames(1, True, 0.0, 24.0), 0, None, RIMS_EVERY)
+    return [rims_of(f.images[0], moved(f.depth), lens.focal_px) for f in frames if f.depth is not None]
 
 
 def main(paths: list[str]) -> None:
