@@ -28,7 +28,6 @@ MOST_VIEWS = 8
 AWAY_S = 2.0  # out of sight for longer, and it may have been moved
 ATTITUDE_CHI2 = 16.27  # 99.9 % of three degrees of freedom
 SHARP_RAD = math.radians(4.0)  # deviation of an attitude at most, of which it is said that it is the right one
-OFF_RAD = 0.01  # by which the window may be turned beyond its covariance, as in the test of one view
 SLOW_M_S = 0.1
 # The wrong one of two attitudes, whose chi-square is larger by E on average, seems better by 16 in 3e-5 of all cases at
 # most, whatever E is: the difference has the mean E and the deviation 2 sqrt(E).
@@ -131,7 +130,7 @@ class Probation:
         d = so3_log(np.ascontiguousarray(believed.R.T @ found.T_world_tag.R))
         turn = believed.R.T @ window.newest.T_world_body.R
         of_window = turn @ window.covariance()[:3, :3] @ turn.T
-        S = found.covariance[:3, :3] + covariance[:3, :3] + of_window + OFF_RAD**2 * np.eye(3)
+        S = found.covariance[:3, :3] + covariance[:3, :3] + of_window + window.config.tag_gate_rad**2 * np.eye(3)
         if math.sqrt(float(np.linalg.eigvalsh(S)[-1])) > SHARP_RAD:
             return ""
         if float(d @ np.linalg.solve(S, d)) > ATTITUDE_CHI2:

@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lodelight.anchors import tag_corners
-from lodelight.estimation.window import Tag, Window
+from lodelight.estimation.window import Tag, Window, WindowConfig
 from lodelight.geometry.se3 import SE3, level
 from lodelight.messages import TagSighting
 from lodelight.tags.gate import KnownTag
 from lodelight.types import Array
 
 AGREE_CHI2 = 22.46  # 99.9 % of six degrees of freedom
-OFF_RAD, OFF_M = 0.01, 0.05  # between two tags, beyond the covariances
 
 
 @dataclass(eq=False)
@@ -60,7 +59,9 @@ class SurveyedTags:
             return None
         name, T_old_tag = by
         T_map_old = level(_place(self.known[name]) @ T_old_tag.inverse(), T_old_tag.t)
-        agreeing = {other for other in self.known if other not in found or self._agree(name, other, found)}
+        agreeing = {
+            other for other in self.known if other not in found or self._agree(name, other, found, window.config)
+        }
         window.align(T_map_old, release_gauge=True)
         self.tied = True
         self._declare(window, agreeing)
@@ -85,7 +86,7 @@ class SurveyedTags:
                 return s.name, T_old_tag
         return None
 
-    def _agree(self, a: str, b: str, found: Mapping[str, tuple[SE3, Array]]) -> bool:
+    def _agree(self, a: str, b: str, found: Mapping[str, tuple[SE3, Array]], config: WindowConfig) -> bool:
         """Whether two tags hang to each other in the window as their surveys say: else only `a` is believed."""
         if a == b or a not in found:
             return True
@@ -95,7 +96,7 @@ class SurveyedTags:
         d = np.concatenate([(surveyed.inverse() @ there).log()[:3], there.t - surveyed.t])
         S = P_a + P_b + self.known[a].covariance + self.known[b].covariance
         swing = float(np.trace(P_a[:3, :3] + self.known[a].covariance[:3, :3])) * float(there.t @ there.t)
-        S = np.diag(np.diag(S)) + np.diag([OFF_RAD**2] * 3 + [OFF_M**2 + swing] * 3)
+        S = np.diag(np.diag(S)) + np.diag([config.tag_gate_rad**2] * 3 + [config.tag_gate_m**2 + swing] * 3)
         return float(d @ np.linalg.solve(S, d)) <= AGREE_CHI2
 
     def _declare(self, window: Window, names: set[str]) -> None:

@@ -8,22 +8,20 @@ tell lengths, they are asked.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from lodelight.anchors import tag_corners
-from lodelight.estimation.window import Tag, TagView, Window
+from lodelight.estimation.window import TagView, Window
 from lodelight.geometry.se3 import SE3
 from lodelight.imu.initialization import Starter, StartView
 from lodelight.imu.preintegration import NavState
 from lodelight.imu.samples import ImuSamples
 from lodelight.messages import TagSighting
 from lodelight.odometry.probation import SURVEY, views_apart
+from lodelight.odometry.tag_views import as_tag, as_view, of_known_size
 from lodelight.rig import CameraSpec
-from lodelight.tags.gate import GateConfig
 from lodelight.tags.pose import tag_poses
 from lodelight.tags.size import MeasuredSize, measured_size
 from lodelight.tags.survey import MappedTag, map_tag
@@ -44,8 +42,7 @@ class TagStart:
 
     def usable(self, sightings: Sequence[TagSighting]) -> list[TagSighting]:
         """Those of a size that may be believed, of tags that are seen once."""
-        copies = Counter(s.name for s in sightings)
-        return [s for s in sightings if s.size_m is not None and copies[s.name] == 1 and s.name not in self.refused]
+        return [s for s in of_known_size(sightings) if s.name not in self.refused]
 
     def with_tags(self, view: StartView, sightings: Sequence[TagSighting]) -> StartView:
         """The view and a row of camera 0 for the centre of each tag, whose tracks are negative."""
@@ -106,11 +103,9 @@ class TagStart:
         T_cam_map = (state.T_world_body @ self.spec.T_body_cam).inverse()
         for s in self.usable(sightings):
             if s.name in placed:
-                assert s.size_m is not None
                 if not window.knows(s.name):
-                    window.declare(Tag(s.name, np.asarray(tag_corners(s.size_m), np.float64)))
-                sigma_px = np.hypot(s.sigma_px, GateConfig.model_px)
-                out.append(TagView(s.name, s.camera, s.corners_px, sigma_px, T_cam_map @ placed[s.name]))
+                    window.declare(as_tag(s))
+                out.append(as_view(s, T_cam_map @ placed[s.name]))
         return out
 
 

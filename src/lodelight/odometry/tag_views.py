@@ -35,11 +35,8 @@ def tag_views(
     its sighting and T_map_cam. Left out are sightings without a size, both copies of a tag that is seen twice, and what
     has no place yet. Held, without a say, are those of known tags on probation.
     """
-    copies = Counter(s.name for s in sightings)
     views, new = [], []
-    for s in sightings:
-        if s.size_m is None or copies[s.name] > 1:
-            continue
+    for s in of_known_size(sightings):
         T_cam_tag: SE3 | None = None
         if not window.knows(s.name):
             tag = surveyed(s.name)
@@ -48,14 +45,30 @@ def tag_views(
                 if T_map_tag is None:
                     continue
                 T_cam_tag = T_map_cam.inverse() @ T_map_tag
-                tag = Tag(s.name, np.asarray(tag_corners(s.size_m), np.float64))
+                tag = as_tag(s)
                 probation.admit(s.name, s.t_ns)
             window.declare(tag)
             new.append(s.name)
-        sigma_px = np.hypot(s.sigma_px, GateConfig.model_px)
-        held = probation.holds(s.name, s.t_ns)
-        views.append(TagView(s.name, s.camera, s.corners_px, sigma_px, T_cam_tag, held=held))
+        views.append(as_view(s, T_cam_tag, probation.holds(s.name, s.t_ns)))
     return views, new
+
+
+def of_known_size(sightings: Sequence[TagSighting]) -> list[TagSighting]:
+    """Those of tags that say their size, but for both copies of one that is seen twice."""
+    copies = Counter(s.name for s in sightings)
+    return [s for s in sightings if s.size_m is not None and copies[s.name] == 1]
+
+
+def as_tag(s: TagSighting) -> Tag:
+    """The tag of a sighting, its place unknown, for `Window.declare`."""
+    assert s.size_m is not None
+    return Tag(s.name, np.asarray(tag_corners(s.size_m), np.float64))
+
+
+def as_view(s: TagSighting, T_cam_tag: SE3 | None, held: bool = False) -> TagView:
+    """A sighting for the window, with the noise of its corners and of the lens."""
+    sigma_px = np.hypot(s.sigma_px, GateConfig.model_px)
+    return TagView(s.name, s.camera, s.corners_px, sigma_px, T_cam_tag, held=held)
 
 
 @dataclass(eq=False)
