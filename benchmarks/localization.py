@@ -223,16 +223,13 @@ def shrunk(rig, frames, scale: float):
     """The recording of a camera with fewer pixels."""
     if scale == 1.0:
         return rig, frames
-    camera = rig.cameras[0].camera
-    size, params = (round(camera.width * scale), round(camera.height * scale)), camera.params.copy()
-    params[:2] *= scale
-    params[2:4] = (params[2:4] + 0.5) * scale - 0.5
-    lens = replace(camera, width=size[0], height=size[1], params=params)
+    rig = rig.with_cameras(1).resized(scale)
+    size = (rig.cameras[0].camera.width, rig.cameras[0].camera.height)
     small = (
         Frame(f.t_ns, (cv2.resize(f.images[0], size, interpolation=cv2.INTER_AREA),)) if isinstance(f, Frame) else f
         for f in frames
     )
-    return replace(rig, cameras=(replace(rig.cameras[0], camera=lens),)), small
+    return rig, small
 
 
 def make_gaps(map: Map, length_m: float) -> None:

@@ -178,6 +178,16 @@ def test_the_image_reaches_half_a_pixel_beyond_its_outer_centres():
     assert camera.inside(px, margin_px=1.0).tolist() == [False] * 5
 
 
+@lenses(LENSES)
+def test_a_resized_camera_sees_a_point_where_its_resized_image_shows_it(camera):
+    larger = camera.resized(1.5)
+    X = points_in_view(camera, 50)
+    px, seen = camera.project(X)
+    share = np.array([larger.width / camera.width, larger.height / camera.height])
+    np.testing.assert_allclose(larger.project(X)[0][seen], (px[seen] + 0.5) * share - 0.5, atol=1e-9)
+    assert larger.project(X)[1].tolist() == seen.tolist()
+
+
 @pytest.mark.parametrize(
     ("model", "size", "intrinsics", "distortion", "says"),
     [

@@ -6,7 +6,7 @@ import pytest
 
 from conftest import shared_data
 from lodelight.features.corners import find_corners, strengths
-from lodelight.features.depth import depth_of_features
+from lodelight.features.depth import depth_at
 from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
 from lodelight.features.frontend import FrontEnd
@@ -16,6 +16,7 @@ from lodelight.features.orb import OrbConfig, OrbExtractor, refine_corners
 from lodelight.features.stereo import StereoMatcher
 from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3
+from lodelight.messages import Frame
 from lodelight.rig import CameraSpec, DepthSpec, Rig
 
 
@@ -190,7 +191,7 @@ def test_depth_is_read_at_the_corner_and_doubted_at_a_rim():
     seen = random_features(rng, 3, camera())
     seen.px[:] = [[50, 200], [319, 200], [105, 105]]
     spec = DepthSpec(camera(), SE3.identity())
-    got = depth_of_features(seen, depth, spec)
+    got = seen.with_depth(*depth_at(seen.px, depth, spec))
     assert got.inv_depth[:2] == pytest.approx([0.5, 0.5])
     assert got.inv_depth[2] == 0
     assert got.sigma_inv_depth[0] * 4 == pytest.approx(np.hypot(0.0012 + 0.0019 * 1.6**2, 0.005 * 2), rel=1e-3)
@@ -203,9 +204,9 @@ def test_what_is_no_depth_is_no_reading_and_makes_no_rim(none):
     seen = random_features(np.random.default_rng(0), 2, cam)
     seen.px[:] = [[100.0, 100.0], [300.0, 200.0]]
     depth = np.full((480, 640), 2.0, np.float32)
-    flat = depth_of_features(seen, depth, DepthSpec(cam, SE3.identity()))
+    flat = seen.with_depth(*depth_at(seen.px, depth, DepthSpec(cam, SE3.identity())))
     depth[100, 100] = depth[200, 301] = none
-    got = depth_of_features(seen, depth, DepthSpec(cam, SE3.identity()))
+    got = seen.with_depth(*depth_at(seen.px, depth, DepthSpec(cam, SE3.identity())))
     assert got.inv_depth.tolist() == [0.0, 0.5]
     assert got.sigma_inv_depth.tolist() == [0.0, flat.sigma_inv_depth[1]]
 
@@ -279,9 +280,27 @@ def test_stereo_of_a_real_drone_agrees_with_semi_global_matching():
     assert np.mean(np.abs(error) > 2.0) < 0.15
 
 
+def test_corners_of_an_enlarged_image_lie_in_the_same_directions_at_the_same_depths():
+    lens, image = Camera.create("radtan", 320, 240, (200.0, 200.0, 159.5, 119.5)), textured(3, 240, 320)
+    depth = np.where(np.arange(320) < 160, 2.0, 4.0).astype(np.float32) * np.ones((240, 1), np.float32)
+    rig = Rig((CameraSpec("cam0", lens, SE3.identity(), row_time_s=1e-4),), DepthSpec(lens, SE3.identity()))
+    as_taken, enlarged = (FrontEnd(rig, "rgbd", OrbConfig(), factor) for factor in (1.0, 2.0))
+    seen, more = (front.process(Frame(0, (image,), depth)) for front in (as_taken, enlarged))
+    np.testing.assert_allclose(enlarged.rig.cameras[0].camera.project(more.ray)[0], more.px, atol=1e-3)
+    off_px = lens.project(more.ray)[0][:, None] - seen.px[seen.octave == 0][None]
+    nearest = np.take_along_axis(off_px, np.linalg.norm(off_px, axis=2).argmin(axis=0)[None, :, None], axis=0)[0]
+    nearest = nearest[np.linalg.norm(nearest, axis=1) < 1.0]  # of the others, no corner was taken there
+    assert len(nearest) > 0.6 * np.count_nonzero(seen.octave == 0)
+    assert np.abs(np.median(nearest, axis=0)).max() < 0.1  # half a pixel of the enlarged image would be 0.25
+    side = lens.project(more.ray)[0][:, 0]
+    clear = np.abs(side - 159.5) > 3.0
+    np.testing.assert_allclose(more.inv_depth[clear], np.where(side[clear] < 159.5, 0.5, 0.25), rtol=1e-6)
+    rows = enlarged.rig.cameras[0]
+    assert rows.row_time_s * rows.camera.height == pytest.approx(1e-4 * 240)
+
+
 def test_an_image_of_another_size_than_the_rig_says_is_named():
     from lodelight.errors import SourceError
-    from lodelight.messages import Frame
 
     rig = Rig((CameraSpec("cam0", camera(), SE3.identity()),))
     with pytest.raises(SourceError, match="320x240"):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +12,9 @@ from conftest import shared_data
 from lodelight.cli.main import main
 from lodelight.io import open_source
 from lodelight.io.rig_toml import write_rig
+from lodelight.localizer import Localizer, LocalizerConfig
 from lodelight.mapping.store import load_map, save_map
+from lodelight.messages import Frame
 from lodelight.slam import Slam, SlamConfig
 
 BLOCK = 50
@@ -60,6 +63,19 @@ def test_a_single_image_is_localized(kitchen, tmp_path, capsys):
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["relocalizations"] == 1
     assert "looking along" in capsys.readouterr().out
     assert '"relocalized","x":{"dtype"' in (tmp_path / "out" / "report.html").read_text()  # on the map, from above
+
+
+def test_a_lens_half_as_long_finds_more_of_the_map_in_enlarged_images(kitchen, monkeypatch):
+    recording = open_source(shared_data("redkitchen"))
+    half = replace(recording.rig.resized(0.5), depth=None)
+    size = (half.cameras[0].camera.width, half.cameras[0].camera.height)
+    frame = next(recording.messages("mono", 75 / 30))
+    small = Frame(0, (cv2.resize(frame.images[0], size, interpolation=cv2.INTER_AREA),))
+    map, inliers = load_map(kitchen / "map.lode"), []
+    for most in (1.0, 2.0):
+        monkeypatch.setattr("lodelight.localizer.MOST_ENLARGED", most)
+        inliers.append(Localizer(half, map, LocalizerConfig(sensors="mono")).feed(small).inliers)
+    assert inliers[1] > 1.3 * inliers[0]
 
 
 def test_mistakes_get_one_line_and_exit_status_2(kitchen, tmp_path, capsys):

@@ -12,6 +12,7 @@ from lodelight.compiled import Stopwatch
 from lodelight.errors import CalibrationError, MapError
 from lodelight.features.frontend import FrontEnd
 from lodelight.features.orb import OrbConfig
+from lodelight.geometry.cameras import Camera
 from lodelight.geometry.se3 import SE3, carried_covariance
 from lodelight.io.pacing import Paced
 from lodelight.io.recording import Recording
@@ -31,6 +32,9 @@ from lodelight.types import Array
 # by angles, and with fewer pixels a radian they are measured the worse.
 DRIFT, DRIFT_FOCAL_PX = 0.02, 460.0
 GUESSED = 0.5  # of the way without anything whose distance is known
+# An image is enlarged to twice its size at most (as Lowe 2004 does: beyond, nothing more comes out of it), and to so
+# many pixels, for the time they take; where less than one octave is wanting, it is not.
+MOST_ENLARGED, MOST_PIXELS = 2.0, 700_000
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,11 @@ class Localizer:
         self.map = map
         self.live = live
         self.on_event = on_event
-        self.front_end = FrontEnd(rig, visual, self.config.orb)
+        self._focal_px = rig.cameras[0].camera.focal_px
+        self.front_end = FrontEnd(
+            rig, visual, self.config.orb, _enlarged(rig.cameras[0].camera, map, self.config.orb.scale_factor)
+        )
+        rig = self.front_end.rig
         self.ladder = Ladder(
             rig, map, self.config.orb, self.config.ladder, self.config.seed, self.config.temporary_points, live,
             self._emit, DeadReckoning(rig.imu, self._emit) if inertial and rig.imu is not None else None,
@@ -193,9 +201,19 @@ class Localizer:
         total = tracked.covariance + carried_covariance(self.map.pose(tracked.reference), known, tracked.T_world_body)
         if self.ladder.states.state is State.carried:
             states = self.ladder.states
-            drift_m = DRIFT * DRIFT_FOCAL_PX / self.ladder.follower.camera.focal_px * states.carried_m
+            drift_m = DRIFT * DRIFT_FOCAL_PX / self._focal_px * states.carried_m
             total[3:, 3:] += (drift_m**2 + (GUESSED * states.guessed_m) ** 2) * np.eye(3)
         return total
+
+
+def _enlarged(camera: Camera, map: Map, octave: float) -> float:
+    """By how much to enlarge the images of a camera for its pyramid to begin where the map's does.
+
+    A shorter lens shows the map's points smaller than they were mapped: below its finest octave, most of them.
+    """
+    wanted = map.rig.cameras[0].camera.focal_px / camera.focal_px
+    factor = min(wanted, MOST_ENLARGED, math.sqrt(MOST_PIXELS / (camera.width * camera.height)))
+    return factor if factor >= octave else 1.0
 
 
 def _check(map: Map) -> None:

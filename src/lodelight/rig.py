@@ -35,6 +35,14 @@ class CameraSpec:
     stamped_row: float = 0.0
     exposure_s: float = 0.0
 
+    def resized(self, factor: float) -> CameraSpec:
+        """The camera whose images are this one's resized: more rows take the same time."""
+        camera = self.camera.resized(factor)
+        rows = camera.height / self.camera.height
+        return replace(
+            self, camera=camera, row_time_s=self.row_time_s / rows, stamped_row=(self.stamped_row + 0.5) * rows - 0.5
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class DepthSpec:
@@ -90,3 +98,7 @@ class Rig:
     def with_cameras(self, count: int) -> Rig:
         """The same rig seen through its first `count` cameras."""
         return replace(self, cameras=self.cameras[:count])
+
+    def resized(self, factor: float) -> Rig:
+        """The rig whose cameras' images are this one's resized. Depth images stay as they are."""
+        return replace(self, cameras=tuple(spec.resized(factor) for spec in self.cameras))

@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from lodelight.compiled import kernel
-from lodelight.features.features import Features
 from lodelight.rig import DepthSpec
 from lodelight.types import ArrayF32
 
@@ -16,11 +15,6 @@ from lodelight.types import ArrayF32
 MISREGISTRATION_PX = 2
 # Scale error of a factory-calibrated sensor, as a share of the depth.
 SCALE_ERROR = 0.005
-
-
-def depth_of_features(features: Features, depth: ArrayF32, spec: DepthSpec) -> Features:
-    """Features with inverse depth and its sigma, as `depth_at` reads them."""
-    return features.with_depth(*depth_at(features.px, depth, spec))
 
 
 def depth_at(px: ArrayF32, depth: ArrayF32, spec: DepthSpec) -> tuple[ArrayF32, ArrayF32]:

@@ -300,6 +300,15 @@ class Camera:
         """(N, 2) px to (N, 3) unit rays in the camera frame, and which pixels have one."""
         return unproject_points(self.model, self.params, np.ascontiguousarray(px, dtype=np.float64))
 
+    def resized(self, factor: float) -> Camera:
+        """The camera whose images are this one's resized, to whole pixels."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        share = np.array([width / self.width, height / self.height])
+        params = self.params.copy()
+        params[:2] *= share
+        params[2:4] = (params[2:4] + 0.5) * share - 0.5
+        return Camera(self.model, width, height, params)
+
     def inside(self, px: Array, margin_px: float = 0.0) -> Bools:
         """Which (N, 2) px lie in the image; a pixel covers half a pixel around its centre."""
         lo, hi_u, hi_v = margin_px - 0.5, self.width - 0.5 - margin_px, self.height - 0.5 - margin_px
