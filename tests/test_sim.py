@@ -19,6 +19,7 @@ from lodelight.sim.builder import Builder
 from lodelight.sim.bvh import STACK, cast_ray
 from lodelight.sim.depth import sense_depth
 from lodelight.sim.faults import Faults
+from lodelight.sim.furniture import rack
 from lodelight.sim.gaits import GAITS, generate
 from lodelight.sim.imager import Imager
 from lodelight.sim.imu import SPECS, read_out
@@ -108,6 +109,19 @@ def test_every_building_has_what_its_anchors_say_where_they_say_it(name):
         _, hit = first_hit(light.xyz + 0.3 * light.normal, -light.normal)
         assert scene.names[hit] == "lamp_face", light.id
     Space(place).check(generate(GAITS["walk"], place.route, 150.0, 0, np.random.default_rng(0)))
+
+
+def test_racks_are_bolted_to_the_floor_and_only_their_goods_change():
+    def built(changed):
+        builder = Builder("shed", 1, np.array([[0.0, 9.0], [9.0, 9.0]]), 5.0, changed)
+        for y in range(8):
+            rack(builder, 0.0, 2.0 * y, 0, 4.8, 3, 1.75, 1.2)
+        quads = builder.mesh.quads
+        return [np.array([q.origin for q in quads if (q.surface == "metal") == frame]) for frame in (True, False)]
+
+    (frames, goods), (frames_later, goods_later) = built(False), built(True)
+    assert np.array_equal(frames, frames_later)
+    assert goods.shape != goods_later.shape or not np.allclose(goods, goods_later)
 
 
 def test_a_changed_building_keeps_walls_and_tags_and_moves_things():

@@ -70,14 +70,17 @@ class Builder:
         return np.random.default_rng([self.seed, zlib.crc32(f"{self.name}/{key}".encode()), variant])
 
     @contextmanager
-    def movable(self, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0) -> Iterator[np.random.Generator]:
+    def movable(
+        self, x: float, y: float, z: float = 0.0, yaw_deg: float = 0.0, bolted: bool = False
+    ) -> Iterator[np.random.Generator]:
         """Build a thing at (x, y, z), or beside it if the building has changed; yields what decides on its contents.
 
+        bolted : to the floor, so that it stays where it is
         A changed building has other contents also in what has not moved, as goods and books are turned over.
         """
         self._items += 1
         chance = self.random(f"change {self._items}")
-        moved = self.changed and chance.random() < MOVED_SHARE
+        moved = self.changed and not bolted and chance.random() < MOVED_SHARE
         if moved:
             x, y, yaw_deg = self._beside(x, y, yaw_deg, chance)
         own = self.random(f"item {self._items}", int(moved))

@@ -151,7 +151,7 @@ def sofa(b: Builder, x: float, y: float, yaw_deg: float) -> None:
 
 def rack(b: Builder, x: float, y: float, yaw_deg: float, length: float, levels: int, pitch: float, deep: float) -> None:
     """A pallet rack: posts, beams, and cartons on every level, seen from both sides."""
-    with b.movable(x, y, 0.0, yaw_deg) as rng:
+    with b.movable(x, y, 0.0, yaw_deg, bolted=True) as rng:
         bays = max(1, round(length / 2.4))
         bay = length / bays
         height = levels * pitch + 0.3
