@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 from corridors import MAPPING, ORB, OTHER, Corridor, walk
+from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
 from lodelight.localization.backwards import Backwards
 from lodelight.localization.beside import ThreadedSearch
 from lodelight.localization.follower import n_temporary
 from lodelight.localization.ladder import Ladder, LadderConfig
+from lodelight.localization.machine import Found
 from lodelight.localization.relocalize import Hint
+from lodelight.localization.second_look import SecondLookConfig
 from lodelight.localization.states import State, States, StatesConfig, Step
+from lodelight.localization.surroundings import Surroundings
+from lodelight.localization.tracked import Tracked
 
 S = 10**9
 
@@ -232,7 +237,7 @@ def test_a_camera_is_found_only_where_it_is_hinted():
 
     def status(T_hint, covariance):
         ladder = Ladder(OTHER, map, ORB, LadderConfig(), 0, True, False, lambda *_, **__: None)
-        ladder.hint = (0, Hint(T_hint, 1.5, covariance))
+        ladder.second_look.hint = (0, Hint(T_hint, 1.5, covariance))
         ladder.locate(0, seen)
         return ladder.status, ladder.why
 
@@ -311,3 +316,31 @@ def test_frames_before_a_camera_was_found_are_followed_back_from_there():
     assert backwards.created > 0
     assert backwards.left == 0
     assert backwards.follow() == []
+
+
+def test_a_carried_camera_is_moved_only_by_two_answers_in_a_row_that_agree():
+    """A place that looks alike is found once, or twice at poses that contradict one another."""
+    nothing = Features.empty()
+    here, there, elsewhere = walk(0.3), walk(0.35), walk(-0.3)
+    carried = Tracked(0, nothing, walk(0.0), np.eye(6), np.zeros(0, np.int32), 0, right_in_map=40)
+
+    class Answers:
+        def __init__(self, *poses, points=80):
+            self.found = [Found(pose, np.eye(6), np.arange(points), "80 points found") for pose in poses]
+
+        def find(self, seen, hint):
+            return self.found.pop(0) if self.found else "no keyframe looks alike"
+
+    def moved(relocalizer):
+        around = Surroundings(relocalizer, SecondLookConfig(every=1), live=False)
+        return [around.look(carried, 0.0) for _ in range(3)]
+
+    assert moved(Answers(here)) == [None] * 3
+    assert moved(Answers(here, elsewhere)) == [None] * 3
+    assert moved(Answers(walk(0.6), walk(0.6))) == [None] * 3  # farther off than carrying can have gone astray
+    assert moved(Answers(here, there, points=55)) == [None] * 3  # no gain over the 40 points that tracking has
+    first, second, third = moved(Answers(here, there))
+    assert first is None
+    assert third is None
+    assert np.linalg.norm(second[0].t - there.t) < 1e-9
+    assert second[1] == "80 points found beside, twice alike"

@@ -126,7 +126,7 @@ class Localizer:
 
         covariance : (6, 6), chart of SE3.perturbed
         """
-        self.ladder.hint = (t_ns, Hint(T_world_body, self.config.hint_reach_m, covariance))
+        self.ladder.second_look.hint = (t_ns, Hint(T_world_body, self.config.hint_reach_m, covariance))
 
     def step(self, frame: Frame) -> Estimate:
         """One frame: see it, locate it."""

@@ -79,6 +79,12 @@ class Follower(Tracker):
         if self.last is not None:
             self.last.temporary = None
 
+    def by_map_alone(self, t_ns: int, seen: Features, T_world_body: SE3, point: Ints | None = None) -> Tracked:
+        """A frame by the map's points alone, from a pose that is nearly right on; point : (N,) matches so far."""
+        index = FeatureIndex(seen, self.camera.width, self.camera.height)
+        known = np.full(len(seen), -1, np.int32) if point is None else point
+        return self.refine(t_ns, seen, T_world_body, known, index, search=5.0, map_alone=True)
+
     def refine(
         self,
         t_ns: int,
