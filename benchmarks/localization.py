@@ -65,11 +65,10 @@ class Query:
         self.estimates: list[Estimate] = []
         self.ms: list[float] = []
         for frame in frames:
-            start, n_events = time.thread_time(), len(self.events)
+            start = time.thread_time()
             estimate = self.localizer.feed(Frame(frame.t_ns, frame.images[:1]) if isinstance(frame, Frame) else frame)
             if estimate is not None:
-                went_back = any(event["kind"] == "followed_back" for event in self.events[n_events:])
-                if estimate.status in ("tracking", "degraded") and not went_back:
+                if estimate.status in ("tracking", "degraded"):
                     self.ms.append(1e3 * (time.thread_time() - start))
                 self.estimates.append(estimate)
         self.localizer.close()

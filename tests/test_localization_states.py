@@ -295,23 +295,33 @@ def test_where_points_are_few_those_of_which_the_distance_is_only_supposed_get_o
     assert max(off_m[found:]) < 0.1
 
 
-def test_frames_before_a_camera_was_found_are_followed_back_from_there():
+def test_frames_before_a_camera_was_found_are_followed_back_from_there_one_beside_each_that_comes():
     """It is asked for only behind a stretch that was redecorated."""
     built = Corridor.built(3)
     map = built.mapped(3)
     now = built.redecorated(5.0, 12.0, seed=1003)
+    looked_back = []
 
-    def begun(rig):
-        return Ladder(rig, map, ORB, LadderConfig(), 0, True, False, lambda *_, **__: None)
+    class Counted(Ladder):
+        def locate(self, t_ns, seen):
+            looked_back.append(t_ns)
+            return super().locate(t_ns, seen)
 
-    ladder, backwards, rng = begun(OTHER), Backwards(OTHER, begun, 90), np.random.default_rng(8)
-    true = {i * S // 10: walk(x, 0.3 * np.sin(0.4 * x), 0.0) for i, x in enumerate(np.arange(5.0, 14.0, 0.08))}
+    def begun(rig, kind=Counted):
+        return kind(rig, map, ORB, LadderConfig(), 0, True, False, lambda *_, **__: None)
+
+    ladder, backwards, rng = begun(OTHER, Ladder), Backwards(OTHER, begun, 90), np.random.default_rng(8)
+    true = {i * S // 10: walk(x, 0.3 * np.sin(0.4 * x), 0.0) for i, x in enumerate(np.arange(5.0, 13.0, 0.08))}
+    poses, frames_back, lost = {}, [], []
     for t_ns, T_world_body in true.items():
         seen, _ = now.seen(OTHER, T_world_body, rng)
         tracked = ladder.locate(t_ns, seen if T_world_body.t[0] > 12.0 else seen.take(np.zeros(0, int)))
-        if poses := dict(backwards.add(tracked, seen)):
-            break
-    assert len(poses) >= 0.9 * t_ns / (S // 10)
+        lost += [t_ns] if tracked.why_lost else []
+        poses.update(backwards.add(tracked, seen))
+        frames_back.append(len(looked_back))
+    poses.update(backwards.follow())
+    assert 1 == np.diff(frames_back).max() < len(poses)
+    assert len(set(poses) & set(lost)) >= 0.9 * len(lost)
     assert max(np.linalg.norm(T.t - true[t].t) for t, T in poses.items()) < 0.1
     assert backwards.created > 0
     assert backwards.left == 0
