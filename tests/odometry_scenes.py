@@ -145,7 +145,7 @@ class Points:
 
     def reset(self) -> None:
         self.drop(self.ids)
-        self.tracks = None
+        self.tracks, self.flow = None, Flow(np.eye(3))
 
 
 def messages(

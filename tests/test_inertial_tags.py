@@ -13,6 +13,7 @@ from lodelight.estimation.window import Window
 from lodelight.estimation.window_frames import moved_row
 from lodelight.geometry.se3 import SE3
 from lodelight.geometry.so3 import so3_exp, so3_log
+from lodelight.messages import Frame
 from lodelight.odometry.probation import Probation
 from lodelight.odometry.tag_views import tag_views
 from tag_flights import WRONG, TaggedWalk, trials
@@ -56,6 +57,45 @@ def test_a_tag_has_no_say_before_its_views_have_shown_that_it_hangs_right():
     wrong = [trial for trial in done if trial.kind != "right"]
     assert [trial for trial in wrong if trial.used or trial.lost] == []
     assert [trial for trial in wrong if trial.kind != "flipped" and not 1 <= trial.named <= 3] == []
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_window_begun_anew_goes_on_in_its_world_and_a_moved_tag_does_not_lay_it_elsewhere(moved):
+    """1.6 s in the dark at 1 m/s: the IMU goes on. Then one tag is seen, which hangs 0.4 m aside or not."""
+    walk = TaggedWalk(1, 8.0, count=48)
+    odometry = walk.odometry()
+    odometry.tie(walk.known())
+    dark = (walk.motion.start_ns + 3_000_000_000, walk.motion.start_ns + 4_600_000_000)
+    shown: list[str] = []
+    done = []
+    for message in walk.messages():
+        if isinstance(message, Frame):
+            unlit = dark[0] < message.t_ns < dark[1]
+            odometry.tracker.wanted = 0 if unlit else 150
+            seen = [] if unlit else walk.look(message)
+            if unlit:
+                odometry.tracker.reset()
+            elif message.t_ns > dark[1] and seen:
+                if not shown:
+                    shown.append(seen[0].id)
+                    T = walk.hung[seen[0].id]
+                    walk.hung[seen[0].id] = SE3(T.R, T.t + moved * np.array([0.4, 0.0, 0.0]))
+                seen = [s for s in walk.look(message) if s.id in shown]
+            step = odometry.feed_frame(message, seen)
+        else:
+            step = odometry.feed_imu(message)
+        if step is not None:
+            done.append((step, odometry._surveyed.tied))
+    anew = max(i for i, (step, _) in enumerate(done) if step.restarted)
+    assert odometry.restarts == 1
+    assert done[anew - 1][0].status == "lost"
+    step, tied = done[anew]
+    error, sigma = np.linalg.norm(walk.error(step)[3:]), np.sqrt(np.trace(step.covariance[3:6, 3:6]))
+    assert not tied
+    assert error < 0.1
+    assert error < 3.0 * sigma
+    assert any(tied for _, tied in done[anew:]) is not moved
+    assert max(np.linalg.norm(walk.error(step)[3:]) for step, _ in done[anew:]) < 0.15
 
 
 def test_both_copies_of_a_tag_seen_twice_in_one_image_are_left_out():

@@ -99,11 +99,16 @@ class Prior:
         turned = self.turned(R_new_old)
         return Prior(self.keys, turned.H, turned.g + turned.H @ (turned.null_space(lin) @ moved))
 
-    def released(self, lin: Mapping[Key, Array]) -> Prior:
-        """Without what it knows of absolute yaw and position: as if the frame it is given in were unknown."""
-        N = self.null_space(lin)
-        scale = np.array([LOOSE_RAD, LOOSE_M, LOOSE_M, LOOSE_M])
-        HN = self.H @ N * scale
-        inside = np.linalg.inv(scale[:, None] * (N.T @ self.H @ N) * scale + np.eye(4))
+    def released(self, lin: Mapping[Key, Array], adrift: Array | None = None) -> Prior:
+        """Without what it knows of absolute yaw and position: as if the frame it is given in were unknown.
+
+        adrift (4, 4) : covariance of a turn about z and a shift that it may be off by, beyond what it knows; default,
+        by anything
+        """
+        if adrift is None:
+            adrift = np.diag(np.square([LOOSE_RAD, LOOSE_M, LOOSE_M, LOOSE_M]))
+        N = self.null_space(lin) @ np.linalg.cholesky(adrift)
+        HN = self.H @ N
+        inside = np.linalg.inv(N.T @ HN + np.eye(4))
         H = self.H - HN @ inside @ HN.T
-        return Prior(self.keys, 0.5 * (H + H.T), self.g - HN @ inside @ (scale * (N.T @ self.g)))
+        return Prior(self.keys, 0.5 * (H + H.T), self.g - HN @ inside @ (N.T @ self.g))

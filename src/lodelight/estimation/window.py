@@ -303,10 +303,13 @@ class Window:
 
     # -- frames
 
-    def align(self, T_new_old: SE3, release_gauge: bool = True, move_tags: bool = True) -> None:
+    def align(
+        self, T_new_old: SE3, release_gauge: bool = True, move_tags: bool = True, adrift: Array | None = None
+    ) -> None:
         """Move the whole window rigidly into another frame: a turn about z and a translation.
 
-        release_gauge : what the prior knew of absolute yaw and position is forgotten, as it was of the old frame
+        release_gauge : what the prior knew of absolute yaw and position is forgotten, as it was of the old frame; or it
+        may be off, given adrift (4, 4), by a turn about z and a shift of that covariance
         move_tags : estimated tags outside the window move as well (another frame), or stay (a loop's correction)
         Raises ValueError where T_new_old tilts the vertical.
         """
@@ -329,7 +332,7 @@ class Window:
         self.tag_states.move(moved, R, move_tags)
         self.prior = self.prior.turned(R)
         if release_gauge:
-            self._release_gauge()
+            self._release_gauge(adrift)
         self._problem = self._covariance = None
 
     def _carry_prior(self) -> None:
@@ -360,12 +363,12 @@ class Window:
         rows |= {("tag", n): s.lin for n, s in enumerate(self.tag_states.states) if s.lin is not None}
         return rows
 
-    def _release_gauge(self) -> None:
+    def _release_gauge(self, adrift: Array | None) -> None:
         for key in [key for key in self.beliefs if key[0] == "frame"]:  # nothing has left yet, and no prior is there
             belief = self.beliefs.pop(key)
             next(frame for frame in self.frames if frame.key == key[1]).lin = belief.mean.copy()
             self.prior = Prior([("pose", key[1]), ("rest", key[1])], belief.information, np.zeros(15))
-        self.prior = self.prior.released(self.lin_rows())
+        self.prior = self.prior.released(self.lin_rows(), adrift)
 
     def _keep_landmarks(self, mask: AnyArray) -> None:
         for name in ("track", "world", "sigma", "seen", "inv_depth"):

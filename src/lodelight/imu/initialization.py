@@ -135,14 +135,18 @@ class Starter:
         return Starter(self.spec, self.T_body_cam, self.focal_px, self.metric, self.config)
 
     def add(self, view: StartView, imu: ImuSamples | None) -> None:
-        """The next image, and the samples since the one before; without them (None) all before is forgotten."""
-        if imu is None:
+        """The next image, and the samples since the one before; without them (None) all before is forgotten, and so it
+        is where an image shows nothing: neither rest nor turns can be told by it."""
+        if imu is None or self._blank(view) or (self.views and self._blank(self.views[-1])):
             self.reset()
         elif self.views:
             self.imu.append(imu)
         self.views.append(view)
         while len(self.views) > 2 and self._span_s > self.config.longest_s:
             del self.views[0], self.imu[0]
+
+    def _blank(self, view: StartView) -> bool:
+        return len(view.first_camera()[0]) < self.config.min_tracks
 
     @property
     def _tags(self) -> tuple[str, ...]:
@@ -157,6 +161,8 @@ class Starter:
         """The start, or what is missing. Raises SourceError where the IMU's units are wrong."""
         c = self.config
         shortest_s = c.shortest_tag_s if self._tags else self._without_tags_s
+        if self.views and self._blank(self.views[-1]):
+            return f"{len(self.views[-1].first_camera()[0])} tracks in this image, {c.min_tracks} are needed"
         if len(self.views) < 3 or self._span_s < min(c.rest_s, shortest_s) - 1e-6:
             return (
                 f"{self._span_s:.2f} s of images and IMU so far; {c.rest_s:.2f} s are needed standing still, "
@@ -221,7 +227,7 @@ class Starter:
         track_b, ray_b = self.views[-1].first_camera()
         _, a, b = np.intersect1d(track_a, track_b, return_indices=True)
         if len(a) < self.config.min_tracks:
-            return math.inf if len(track_a) >= self.config.min_tracks else 0.0
+            return math.inf
         return float(np.median(np.linalg.norm(ray_a[a] - ray_b[b], axis=1))) * self.focal_px
 
     # -- in motion ----------------------------------------------------------------------------------------------

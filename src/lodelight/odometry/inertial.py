@@ -21,6 +21,7 @@ from lodelight.imu.samples import ImuSamples
 from lodelight.imu.stream import ImuStream
 from lodelight.imu.vibration import Vibration
 from lodelight.messages import Frame, Imu, Status, TagSighting
+from lodelight.odometry.gap import Continuation, Left, continued
 from lodelight.odometry.keyframing import KeyframeRule, LastKeyframe, keyframe_reason
 from lodelight.odometry.probation import Probation
 from lodelight.odometry.surveyed import SurveyedTags
@@ -116,7 +117,8 @@ class InertialOdometry:
         self._last_ns: int | None = None
         self._keyframe: LastKeyframe | None = None
         self._blind_since: int | None = None
-        self._left_at: NavState | None = None  # where the last window was left
+        self._left: Left | None = None  # where the last window was left
+        self._believed = self._nowhere(0), UNKNOWN_15  # the last state that was, and its covariance
         self._views: list[tuple[Tracks, Sequence[TagSighting]]] = []  # of the starter's images
         self._tag_start = TagStart(rig.cameras[0])
         self._check: ScaleCheck | None = None
@@ -184,18 +186,19 @@ class InertialOdometry:
         self._judge_tags(tags, solution)
         state = window.newest
         inliers = len(tracks) - len(solution.outliers)
-        failure = self._failure(solution, state) or self._blind(inliers, frame.t_ns)
-        failure = failure or self._wrong_scale(tracks, imu, state.T_world_body)
-        if failure:
-            return self._fail(frame, failure)
+        failure = self._failure(solution, state) or self._wrong_scale(tracks, imu, state.T_world_body)
+        blind = "" if failure else self._blind(inliers, frame.t_ns)
+        if failure or blind:
+            return self._fail(frame, failure or blind, reliable=not failure)
         self.tracker.drop(solution.outliers)
         if reason:
             self._keyframe = LastKeyframe(frame.t_ns, state.T_world_body, tracks)
-        blind = self._blind_since is not None
-        why = f"{inliers} tracks agree, fewer than {self.config.few_tracks}: the IMU carries the pose" if blind else ""
+        few = self._blind_since is not None
+        why = f"{inliers} tracks agree, fewer than {self.config.few_tracks}: the IMU carries the pose" if few else ""
+        self._believed = state, self._covariance(window)
         self.stream.forget_before(frame.t_ns)
         return OdometryStep(
-            frame, "degraded" if blind else "tracking", state, window.covariance(), tracks, inliers, reason, why,
+            frame, "degraded" if few else "tracking", *self._believed, tracks, inliers, reason, why,
             tied=self._surveyed.tied and not used.isdisjoint(self._surveyed.known),
         )  # fmt: skip
 
@@ -295,13 +298,12 @@ class InertialOdometry:
         start = self.starter.find() if imu is not None else missing
         found = self._started(start) if isinstance(start, Started) else start
         if isinstance(found, str):
-            status: Status = "lost" if self._left_at is not None else "initializing"
+            status: Status = "lost" if self._left is not None else "initializing"
             return OdometryStep(frame, status, self._nowhere(frame.t_ns), UNKNOWN_15, tracks, why=found)
         state = found.newest
+        self._believed = state, self._covariance(found)
         self._keyframe = LastKeyframe(frame.t_ns, state.T_world_body, tracks)
-        return OdometryStep(
-            frame, "tracking", state, found.covariance(), tracks, len(tracks), "the start", restarted=True
-        )
+        return OdometryStep(frame, "tracking", *self._believed, tracks, len(tracks), "the start", restarted=True)
 
     def _started(self, start: Started) -> Window | str:
         """The window, begun with the images of the start, and solved; or why that failed."""
@@ -313,8 +315,8 @@ class InertialOdometry:
         else:
             chosen = np.unique(np.linspace(0, len(views) - 1, min(self.config.window.keyframes, len(views))).round())
         chosen = chosen.astype(int)
-        moved = self._continued(start.states[int(chosen[0])])
-        start_states = [_moved(state, moved) for state in start.states]
+        on = self._continued(start.states[int(chosen[0])])
+        start_states = [_moved(state, on.T_map_new if on else SE3.identity()) for state in start.states]
         states = [start_states[i] for i in chosen]
         placed = self._placed(start, start_states, seen)
         if isinstance(placed, str):
@@ -338,7 +340,8 @@ class InertialOdometry:
         if failure:
             return f"a start was found ({start.why}), but {failure}"
         self.emit(window.newest.t_ns, "start", how=start.how, why=start.why)
-        self.window, self._blind_since, self._surveyed.tied = window, None, False
+        self.window, self._blind_since = window, None
+        self._surveyed.begin_anew(on)
         self._new_tags.seen.clear()
         self._probation.tried.clear()
         for name in placed:
@@ -379,15 +382,20 @@ class InertialOdometry:
             self._name(name, tracks.t_ns, why)
         return "; ".join(f"it began by {name}, but {why}" for name, why in wrong.items())
 
-    def _continued(self, first: NavState) -> SE3:
-        """T_new_old, a turn about z and a shift, that puts a state where the last window was left."""
-        if self._left_at is None:
-            return SE3.identity()
-        left = self._left_at.T_world_body
-        yaw = _yaw(left.R) - _yaw(first.T_world_body.R)
-        c, s = math.cos(yaw), math.sin(yaw)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return SE3(R, left.t - R @ first.T_world_body.t)
+    def _continued(self, first: NavState) -> Continuation | None:
+        """Where a window that begins with this state goes on; None for the first of all."""
+        if self._left is None:
+            return None
+        samples = self.stream.between(self._left.state.t_ns, first.t_ns)
+        return continued(self._left, first, samples, self.spec)
+
+    def _covariance(self, window: Window) -> Array:
+        """(15, 15) of the window's newest state; of one that goes on where another was left, of where that is too."""
+        covariance = window.covariance()
+        if self._surveyed.goes_on is not None:
+            covariance = covariance.copy()
+            covariance[:6, :6] += self._surveyed.goes_on.spread(window.newest.T_world_body)
+        return covariance
 
     def _failure(self, solution: Solution, state: NavState) -> str:
         """Why the window is believed no more; empty where it is."""
@@ -414,11 +422,12 @@ class InertialOdometry:
         blind_s = (t_ns - self._blind_since) * 1e-9
         return f"{inliers} tracks for {blind_s:.2f} s" if blind_s > self.config.blind_s else ""
 
-    def _fail(self, frame: Frame, why: str) -> OdometryStep:
-        """Leave the window; begin to look for a new start with this very frame."""
+    def _fail(self, frame: Frame, why: str, reliable: bool = False) -> OdometryStep:
+        """Leave the window; begin to look for a new start with this very frame. reliable : it saw nothing, and is left
+        for that alone."""
         assert self.window is not None
         self.emit(frame.t_ns, "failure", why=why)
-        self._left_at = self.window.keyframes()[-1]
+        self._left = Left(*self._believed, reliable)
         self._tag_start.refused |= set() if self._check is None else set(self._check.sizes)  # it may be their fault
         self.window, self._keyframe, self._blind_since, self._check = None, None, None, None
         self.restarts += 1
@@ -432,7 +441,7 @@ class InertialOdometry:
         return OdometryStep(frame, "lost", self._nowhere(frame.t_ns), UNKNOWN_15, tracks, why=why)
 
     def _nowhere(self, t_ns: int) -> NavState:
-        T = self._left_at.T_world_body if self._left_at is not None else SE3.identity()
+        T = self._left.state.T_world_body if self._left is not None else SE3.identity()
         return NavState(t_ns, T, np.zeros(3), np.zeros(3), np.zeros(3))
 
     def _view(self, tracks: Tracks) -> StartView:
@@ -450,10 +459,6 @@ class InertialOdometry:
             np.concatenate([tracks.ray, ray_right]), np.concatenate([own, none]),
             np.concatenate([tracks.sigma_inv_depth, none]), self.tracker.flow.R_now_last,
         )  # fmt: skip
-
-
-def _yaw(R: Array) -> float:
-    return math.atan2(R[1, 0], R[0, 0])
 
 
 def _moved(state: NavState, T: SE3) -> NavState:

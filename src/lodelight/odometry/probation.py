@@ -16,13 +16,14 @@ import numpy as np
 
 from lodelight.estimation.window import Window
 from lodelight.geometry.se3 import SE3
-from lodelight.geometry.so3 import so3_log
 from lodelight.messages import TagSighting
 from lodelight.rig import CameraSpec
 from lodelight.tags.size import measured_size
-from lodelight.tags.survey import MappedTag, SurveyConfig, TagView, map_tag
+from lodelight.tags.survey import MappedTag, SurveyConfig, TagView, against, map_tag
+from lodelight.types import Array
 
 FRAMES = 3  # in a row in which a sighting must agree
+AGAINST = 2  # frames in a row that contradict, after which a tag is named: one that hangs right may do it once
 APART_M, APART_DEG = 0.05, 3.0  # views nearer to each other say the same twice
 MOST_VIEWS = 8
 AWAY_S = 2.0  # out of sight for longer, and it may have been moved
@@ -31,7 +32,7 @@ SHARP_RAD = math.radians(4.0)  # deviation of an attitude at most, of which it i
 SLOW_M_S = 0.1
 # The wrong one of two attitudes, whose chi-square is larger by E on average, seems better by 16 in 3e-5 of all cases at
 # most, whatever E is: the difference has the mean E and the deviation 2 sqrt(E).
-SURVEY = SurveyConfig(min_views=1, rival_chi2=16.0, hypotheses=2)
+SURVEY = SurveyConfig(min_views=1, rival_chi2=ATTITUDE_CHI2, hypotheses=2)
 
 
 def scale_of(window: Window) -> float:
@@ -64,12 +65,13 @@ def in_window(window: Window, sightings: list[TagSighting], T_body_cam: SE3) -> 
 
 @dataclass(eq=False)
 class _Tried:
-    """agreed : frames in a row; admitted : it has a say; why : it was found to hang otherwise, or of another size
-    named : so that it is told once while it is in sight
+    """agreed, against : frames in a row; admitted : it has a say; why : it was found to hang otherwise, or of another
+    size; named : so that it is told once while it is in sight
     """
 
     seen_ns: int
     agreed: int = 0
+    against: int = 0
     admitted: bool = False
     named: bool = False
     why: str = ""
@@ -107,35 +109,46 @@ class Probation:
         one = self.tried[s.name]
         if rejected and one.admitted:
             one.admitted, one.seen = False, []
-        one.agreed = 0 if rejected else one.agreed + 1
         if one.admitted or one.why or s.size_m is None:
             return ""
         one.seen.append(s)
         views = views_apart(in_window(window, one.seen, self.spec.T_body_cam))
-        if views[-1].sighting is not s and one.agreed != FRAMES:  # from where the last one was
-            return ""
-        measured = measured_size(views, s.size_m, self.spec.camera) if rejected or one.agreed >= FRAMES else None
-        one.why = measured.contradicts(scale_of(window)) if measured is not None else ""
-        if not one.why and one.agreed >= FRAMES:
-            one.why = self._turned(views, s, window)
+        new = views[-1].sighting is s  # from elsewhere than the last one
+        if not new:
+            views[-1] = TagView(s, window.newest.T_world_body @ self.spec.T_body_cam)
+        one.why = self._turned(one, views, s, window, rejected)
+        if not one.why and (rejected or one.agreed >= FRAMES) and (new or one.agreed == FRAMES):
+            measured = measured_size(views, s.size_m, self.spec.camera)
+            one.why = measured.contradicts(scale_of(window)) if measured is not None else ""
+            if not one.why and one.agreed >= FRAMES and self._settled(views, s, window):
+                one.admitted = True
+                window.admit(s.name)
         return one.why
 
-    def _turned(self, views: list[TagView], s: TagSighting, window: Window) -> str:
-        """By how much a tag is turned from where it is believed; if not at all, and that is clear, it is admitted."""
+    def _turned(self, one: _Tried, views: list[TagView], s: TagSighting, window: Window, rejected: bool) -> str:
+        """Count the frames that agree or contradict; by how much a tag is turned, once two in a row contradict."""
+        assert s.size_m is not None
+        believed, _ = window.tag(s.name)
+        chi2, turn = against(views, believed, self._attitude(s, window), s.size_m, self.spec.camera, SURVEY)
+        turned = chi2 > ATTITUDE_CHI2
+        one.agreed, one.against = (0, one.against + 1) if rejected or turned else (one.agreed + 1, 0)
+        if not turned or one.against < AGAINST:
+            return ""
+        return f"its views say that it is turned by {math.degrees(turn):.0f} deg from where it should hang; not used"
+
+    def _settled(self, views: list[TagView], s: TagSighting, window: Window) -> bool:
+        """Whether it is clear how a tag hangs, and well enough known that it cannot hang otherwise than it should."""
         assert s.size_m is not None
         found = map_tag(views, s.size_m, self.spec.camera, SURVEY)
         if not isinstance(found, MappedTag):
-            return ""
+            return False
+        S = found.covariance[:3, :3] + self._attitude(s, window)
+        return math.sqrt(float(np.linalg.eigvalsh(S)[-1])) <= SHARP_RAD
+
+    def _attitude(self, s: TagSighting, window: Window) -> Array:
+        """(3, 3) covariance of how a tag should hang as the window sees it, rad^2, about its axes."""
         believed, covariance = window.tag(s.name)
-        d = so3_log(np.ascontiguousarray(believed.R.T @ found.T_world_tag.R))
         turn = believed.R.T @ window.newest.T_world_body.R
         of_window = turn @ window.covariance()[:3, :3] @ turn.T
-        S = found.covariance[:3, :3] + covariance[:3, :3] + of_window + window.config.tag_gate_rad**2 * np.eye(3)
-        if math.sqrt(float(np.linalg.eigvalsh(S)[-1])) > SHARP_RAD:
-            return ""
-        if float(d @ np.linalg.solve(S, d)) > ATTITUDE_CHI2:
-            turned = math.degrees(float(np.linalg.norm(d)))
-            return f"its views say that it is turned by {turned:.0f} deg from where it should hang; it is not used"
-        self.tried[s.name].admitted = True
-        window.admit(s.name)
-        return ""
+        total: Array = covariance[:3, :3] + of_window + window.config.tag_gate_rad**2 * np.eye(3)
+        return total

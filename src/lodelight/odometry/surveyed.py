@@ -16,19 +16,33 @@ import numpy as np
 from lodelight.anchors import tag_corners
 from lodelight.estimation.window import Tag, Window, WindowConfig
 from lodelight.geometry.se3 import SE3, level
+from lodelight.geometry.so3 import so3_exp, so3_log
 from lodelight.messages import TagSighting
-from lodelight.tags.gate import KnownTag
+from lodelight.odometry.gap import Continuation
+from lodelight.tags.gate import GateConfig, KnownTag
 from lodelight.types import Array
 
-AGREE_CHI2 = 22.46  # 99.9 % of six degrees of freedom
+AGREE_CHI2, TOGETHER_CHI2 = 22.46, 26.12  # 99.9 % of six degrees of freedom, and of eight
 
 
 @dataclass(eq=False)
 class SurveyedTags:
-    """known : by name, all with a place, in the map's frame. tied : the window lies among them"""
+    """known : by name, all with a place, in the map's frame. tied : the window lies among them
+
+    goes_on : where the window does, where another was left before it; None once it is tied. That may be far off, and so
+    may a tag: it is laid down by one that is where it is expected, if that is known well enough to tell, or by two that
+    agree with each other
+    """
 
     known: dict[str, KnownTag] = field(default_factory=dict)
     tied: bool = False
+    goes_on: Continuation | None = None
+    _met: dict[str, tuple[SE3, Array]] = field(default_factory=dict)  # by a window that lies among none yet
+
+    def begin_anew(self, goes_on: Continuation | None) -> None:
+        """A new window lies among no tags."""
+        self.tied, self.goes_on = False, goes_on
+        self._met.clear()
 
     def learn(self, known: Mapping[str, KnownTag], window: Window | None) -> None:
         """What is surveyed now. Where a tag's place has changed, so has the map's frame, and the window is not tied."""
@@ -54,27 +68,44 @@ class SurveyedTags:
         if self.tied:
             return None
         found = {name: at for name, at in window.tags().items() if name in self.known} if self._any(window) else {}
-        by = self._best(found) or self._by_sighting(sightings, placed)
+        self._met = {name: at for name, at in (self._met | found).items() if name in self.known}
+        by = self._best(window.config) if self._met or self.goes_on else self._by_sighting(sightings, placed)
         if by is None:
             return None
         name, T_old_tag = by
-        T_map_old = level(_place(self.known[name]) @ T_old_tag.inverse(), T_old_tag.t)
-        agreeing = {
-            other for other in self.known if other not in found or self._agree(name, other, found, window.config)
-        }
-        window.align(T_map_old, release_gauge=True)
-        self.tied = True
+        agreeing = {other for other in self.known if other not in found or self._agree(name, other, window.config)}
+        if self.goes_on is not None and self._expected(name, window.config):  # it knows better than by one tag
+            T_map_old = SE3.identity()
+            window.align(T_map_old, adrift=self.goes_on.adrift)
+        else:
+            T_map_old = level(_place(self.known[name]) @ T_old_tag.inverse(), T_old_tag.t)
+            window.align(T_map_old)
+        self.tied, self.goes_on = True, None
+        self._met.clear()
         self._declare(window, agreeing)
         return T_map_old, name
 
     def _any(self, window: Window) -> bool:
         return any(window.knows(name) for name in self.known)
 
-    @staticmethod
-    def _best(found: Mapping[str, tuple[SE3, Array]]) -> tuple[str, SE3] | None:
-        """The tag that the window knows best."""
-        name = min(found, key=lambda name: float(np.trace(found[name][1])), default=None)
-        return None if name is None else (name, found[name][0])
+    def _best(self, config: WindowConfig) -> tuple[str, SE3] | None:
+        """The tag with which most others agree, and of several the one that the window knows best."""
+        votes = {a: sum(self._agree(a, b, config) for b in self._met) for a in self._met}
+        if self.goes_on is not None:
+            votes = {name: n for name, n in votes.items() if n > 1 or self._expected(name, config)}
+        name = min(votes, key=lambda name: (-votes[name], float(np.trace(self._met[name][1]))), default=None)
+        return None if name is None else (name, self._met[name][0])
+
+    def _expected(self, name: str, config: WindowConfig) -> bool:
+        """Whether a tag is where a window that goes on expects it, and that is known well enough to tell."""
+        assert self.goes_on is not None
+        (T, P), spread = self._met[name], self.goes_on.spread(self._met[name][0])
+        if float(np.linalg.eigvalsh(spread[3:, 3:])[-1]) > GateConfig.vague_m**2:
+            return False
+        surveyed = _place(self.known[name])
+        d = np.concatenate([(surveyed.inverse() @ T).log()[:3], T.t - surveyed.t])
+        gate = np.diag([config.tag_gate_rad**2] * 3 + [config.tag_gate_m**2] * 3)
+        return float(d @ np.linalg.solve(P + spread + self.known[name].covariance + gate, d)) <= AGREE_CHI2
 
     def _by_sighting(
         self, sightings: Sequence[TagSighting], placed: Callable[[TagSighting], SE3 | None]
@@ -86,18 +117,25 @@ class SurveyedTags:
                 return s.name, T_old_tag
         return None
 
-    def _agree(self, a: str, b: str, found: Mapping[str, tuple[SE3, Array]], config: WindowConfig) -> bool:
-        """Whether two tags hang to each other in the window as their surveys say: else only `a` is believed."""
-        if a == b or a not in found:
+    def _agree(self, a: str, b: str, config: WindowConfig) -> bool:
+        """Whether two tags hang to each other in the window as their surveys say, once it is turned about the vertical;
+        else only `a` is believed."""
+        if a == b or a not in self._met:
             return True
-        (T_a, P_a), (T_b, P_b) = found[a], found[b]
-        there = T_a.inverse() @ T_b
-        surveyed = _place(self.known[a]).inverse() @ _place(self.known[b])
-        d = np.concatenate([(surveyed.inverse() @ there).log()[:3], there.t - surveyed.t])
-        S = P_a + P_b + self.known[a].covariance + self.known[b].covariance
-        swing = float(np.trace(P_a[:3, :3] + self.known[a].covariance[:3, :3])) * float(there.t @ there.t)
-        S = np.diag(np.diag(S)) + np.diag([config.tag_gate_rad**2] * 3 + [config.tag_gate_m**2 + swing] * 3)
-        return float(d @ np.linalg.solve(S, d)) <= AGREE_CHI2
+        (T_a, P_a), (T_b, P_b) = self._met[a], self._met[b]
+        hung = [_place(self.known[name]) for name in (a, b)]
+        P = [P_a + self.known[a].covariance, P_b + self.known[b].covariance]
+        W = np.zeros((9, 9))
+        W[:3, :3], W[3:6, 3:6] = (np.linalg.inv(Q[:3, :3] + config.tag_gate_rad**2 * np.eye(3)) for Q in P)
+        W[6:, 6:] = np.linalg.inv(P[0][3:, 3:] + P[1][3:, 3:] + config.tag_gate_m**2 * np.eye(3))
+        R = level(hung[0] @ T_a.inverse(), T_a.t).R
+        for _ in range(4):
+            there, away = [R @ T_a.R, R @ T_b.R], R @ (T_b.t - T_a.t)
+            turned = [so3_log(np.ascontiguousarray(T.R.T @ now)) for T, now in zip(hung, there, strict=True)]
+            e = np.concatenate([*turned, away - (hung[1].t - hung[0].t)])
+            J = np.concatenate([there[0][2], there[1][2], [-away[1], away[0], 0.0]])
+            R = so3_exp(np.array([0.0, 0.0, -float(J @ W @ e) / float(J @ W @ J)])) @ R
+        return float(e @ W @ e) <= TOGETHER_CHI2
 
     def _declare(self, window: Window, names: set[str]) -> None:
         """Tell of surveys to a window that has these tags already; of others it is told at their first sight."""
