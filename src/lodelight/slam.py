@@ -32,7 +32,7 @@ from lodelight.mapping.light_ties import LightsConfig
 from lodelight.mapping.local import LocalMapper, LocalMappingConfig, adjust
 from lodelight.mapping.loops import LoopCloser, LoopConfig
 from lodelight.mapping.map import Map
-from lodelight.mapping.path import PathNode, laid_down
+from lodelight.mapping.path import Path, PathNode, laid_down
 from lodelight.mapping.places import Places
 from lodelight.mapping.tags import MapTags, MapTagsConfig
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
@@ -279,7 +279,7 @@ class Slam:
         self.mapper = LocalMapper(map, orb, config.mapping)
         self.loops = LoopCloser(map, orb, places, config.loops, self.emit)
         self.tags = MapTags(map, orb, config.mapping.sigma_px, self.anchors.tags, config.tags, self.emit, upright)
-        self.path: list[PathNode] = []
+        self.path = Path()
         return find
 
     def _first_views(self) -> FirstViews:

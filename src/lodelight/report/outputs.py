@@ -27,6 +27,7 @@ from lodelight.io.covariances import write_covariances
 from lodelight.io.text import write_text
 from lodelight.io.trajectories import write_tum
 from lodelight.messages import Estimate
+from lodelight.report.frame_log import FrameLog
 from lodelight.report.html import write_report
 from lodelight.report.metrics import ate_entry, peak_rss_mb, spread_ms, state_fractions, with_map_stats
 from lodelight.report.plain import json_line, plain
@@ -48,9 +49,8 @@ class Outputs:
 
     def __init__(self, out: Path, config: dict[str, Any]) -> None:
         self.out = Path(out)
-        self._estimates: list[Estimate] = []
-        self._times_ms: list[tuple[float, float]] = []
-        self._details: list[dict[str, Any]] = []
+        self._frames = FrameLog()
+        self._why = ""  # of the last frame
         self._lock = threading.Lock()
         try:
             self.out.mkdir(parents=True, exist_ok=True)
@@ -77,12 +77,11 @@ class Outputs:
         track_ms : from the decoded image to its pose; map_ms : mapping done for this frame, 0 where it was none
         details : further columns of `frames.csv`
         """
-        before = self._estimates[-1].status if self._estimates else None
+        before = self._frames.status[-1] if len(self._frames) else None
         if estimate.status != before:
             self.event(estimate.t_ns, "state", before=before, now=estimate.status, why=estimate.why)
-        self._estimates.append(estimate)
-        self._times_ms.append((track_ms, map_ms))
-        self._details.append(details)
+        self._frames.add(estimate, track_ms, map_ms, details)
+        self._why = estimate.why
 
     def finish(
         self,
@@ -106,47 +105,39 @@ class Outputs:
             world, of which the live one then counts from the frame on that was)
         tags : as they were found; into `anchors.toml`, and their corners into the cloud
         """
-        if self._estimates and not self._estimates[-1].localized:  # what was missing to the end
-            last = self._estimates[-1]
-            self.event(last.t_ns, "state", before=last.status, now=last.status, why=last.why)
+        frames, localized = self._frames, self._frames.column("localized").astype(np.bool_)
+        if len(frames) and not localized[-1]:  # what was missing to the end
+            status = frames.status[-1]
+            self.event(int(frames.column("t_ns")[-1]), "state", before=status, now=status, why=self._why)
         self.close()
-        localized = [e for e in self._estimates if e.localized]
-        live = Trajectory.from_poses([e.t_ns for e in localized], [e.T_world_body for e in localized])
+        live = frames.trajectory(localized)
         write_tum(self.out / "trajectory.tum", final)
         write_tum(self.out / "trajectory_live.tum", live)
-        write_covariances(self.out / "covariance.csv", live.t_ns.tolist(), [e.covariance for e in localized])
-        write_text(self.out / "frames.csv", self._frames_csv())
+        write_covariances(self.out / "covariance.csv", live.t_ns.tolist(), frames.covariances(localized))
+        write_text(self.out / "frames.csv", frames.csv())
         write_cloud(self.out / "cloud.ply", cloud_xyz, tags)
         write_anchors(self.out / "anchors.toml", Anchors(tuple(tags)))
-        statuses = [e.status for e in self._estimates]
+        track_ms, map_ms = frames.column("ms").reshape(-1, 2).T.tolist()
         metrics: dict[str, Any] = {
-            "frames": len(self._estimates),
-            "tracked_fraction": len(localized) / max(len(self._estimates), 1),
+            "frames": len(frames),
+            "tracked_fraction": int(localized.sum()) / max(len(frames), 1),
             **with_map_stats(map_stats),
-            "ms_per_frame": spread_ms([track for track, _ in self._times_ms]),
-            "ms_per_keyframe": spread_ms([mapping for _, mapping in self._times_ms if mapping > 0]),
+            "ms_per_frame": spread_ms(track_ms),
+            "ms_per_keyframe": spread_ms([mapping for mapping in map_ms if mapping > 0]),
             "compile_s": compile_s,
             "real_time_factor": (wall_s - compile_s) / recording_s if recording_s > 0 else None,
             "peak_rss_mb": peak_rss_mb(),
-            "states": state_fractions(statuses),
+            "states": state_fractions(frames.status),
             "ate": None,
         }
         if truth is not None:
-            in_world = [e for e in localized if align != "none" or e.details.get("aligned", 1.0)]
-            then = Trajectory.from_poses([e.t_ns for e in in_world], [e.T_world_body for e in in_world])
+            aligned = frames.column("aligned").astype(np.bool_)
+            then = frames.trajectory(localized if align != "none" else localized & aligned)
             metrics["ate"] = {"final": ate_entry(final, truth, align), "live": ate_entry(then, truth, align)}
         metrics = plain(metrics)
         write_text(self.out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
         write_report(self.out, truth, align)
         return metrics
-
-    def _frames_csv(self) -> str:
-        extra = sorted({name for details in self._details for name in details})
-        lines = [",".join(["t_ns,status,inliers,track_ms,map_ms", *extra]) + "\n"]
-        for e, (track_ms, map_ms), details in zip(self._estimates, self._times_ms, self._details, strict=True):
-            cells = [f"{details[name]:g}" if name in details else "" for name in extra]
-            lines.append(",".join([f"{e.t_ns},{e.status},{e.inliers},{track_ms:.3f},{map_ms:.3f}", *cells]) + "\n")
-        return "".join(lines)
 
     def close(self) -> None:
         """No more events. Raises SourceError where the last of them did not reach the disk."""
