@@ -1,8 +1,10 @@
-"""What the inertial system's noise rests on: `python benchmarks/inertial.py imu|starts|tracks FOLDER`.
+"""What the inertial system's noise rests on, and its memory: `python benchmarks/inertial.py imu|starts|tracks|memory
+FOLDER`.
 
 imu FOLDER : an EuRoC recording with groundtruth/*.csv; its IMU against its truth, as a density by averaging time
 starts FOLDER : of the same; starts in flight along it, with its IMU and simulated tracks: how many are wrong
 tracks FOLDER : a rendered recording (`lodelight sim`); how far tracks leave their points, by frames in between
+memory FOLDER : a recording that ends where and as it began, flown lap after lap for 30 minutes
 """
 
 from __future__ import annotations
@@ -14,8 +16,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import json
 import sys
+import tempfile
 from collections import defaultdict
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +34,14 @@ from lodelight.io.sources import open_source
 from lodelight.io.trajectories import read_trajectory
 from lodelight.messages import Frame, Imu
 from lodelight.odometry.inertial import InertialOdometry
+from lodelight.report.metrics import peak_rss_mb
+from lodelight.report.outputs import Outputs
 from lodelight.rig import ImuSpec
 from lodelight.sim import rigs
 from lodelight.sim.motion import GRAVITY, Motion
 from lodelight.sim.scenarios import Request, prepare
 from lodelight.sim.space import Space
+from lodelight.slam import Slam, SlamConfig
 from odometry_scenes import Points
 
 STEP_S = 0.05
@@ -115,9 +121,48 @@ def tracks(folder: Path, start_s: float = 12.0, end_s: float = 24.0) -> None:
         print(f"{gap} frames: {1.4826 * np.median(np.abs(change)):.3f} px an axis (1.48 times the median)")
 
 
+def memory(folder: Path, minutes: float = 30.0, every_min: float = 2.0) -> None:
+    slam: Slam | None = None
+    shift = frames = localized = 0
+    told = 0.0
+    with tempfile.TemporaryDirectory() as out, Outputs(Path(out), {}) as outputs:
+        while shift < minutes * 60e9:
+            recording = open_source(folder)
+            if slam is None:
+                slam = Slam(recording.rig, SlamConfig(sensors=recording.rig.sensors), on_event=outputs.event)
+            first_ns, last_ns = recording.span_ns
+            lap_ns = last_ns - first_ns
+            for message in recording.messages(slam.config.sensors):
+                if message.t_ns < first_ns or message.t_ns >= last_ns:
+                    continue
+                estimate = slam.feed(replace(message, t_ns=message.t_ns + shift))
+                if estimate is None:
+                    continue
+                details = dict(estimate.details)
+                outputs.frame(estimate, details.pop("track_ms"), 0.0, **details)
+                frames, localized = frames + 1, localized + estimate.localized
+                now = (estimate.t_ns - first_ns) / 60e9
+                if now >= told + every_min:
+                    told += every_min
+                    k = slam.map.keyframes
+                    print(
+                        f"minute {told:4.0f}: {_resident_mb():4.0f} MB (most so far {peak_rss_mb():.0f}), "
+                        f"{int(k.alive.sum())} of {len(k)} keyframes, {len(slam.map.alive_points)} points, "
+                        f"{localized} of {frames} frames", flush=True,
+                    )  # fmt: skip
+            shift += lap_ns
+    assert slam is not None
+    slam.close()
+    print(f"all adjusted: {_resident_mb():.0f} MB (most {peak_rss_mb():.0f})")
+
+
+def _resident_mb() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
 if __name__ == "__main__":
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("what", choices=("imu", "starts", "tracks"))
+    arguments.add_argument("what", choices=("imu", "starts", "tracks", "memory"))
     arguments.add_argument("folder", type=Path)
     options = arguments.parse_args()
-    {"imu": imu, "starts": starts, "tracks": tracks}[options.what](options.folder)
+    {"imu": imu, "starts": starts, "tracks": tracks, "memory": memory}[options.what](options.folder)

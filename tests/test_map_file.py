@@ -19,7 +19,7 @@ from lodelight.errors import MapError
 from lodelight.geometry.se3 import SE3
 from lodelight.io.rig_toml import format_rig
 from lodelight.mapping import invariants, store
-from lodelight.mapping.compact import compacted
+from lodelight.mapping.compact import compacted, squeeze
 from lodelight.mapping.map import Map
 from lodelight.mapping.mapfile import DamagedMap
 from lodelight.mapping.store import check_map, load_map, map_info, save_map
@@ -147,6 +147,27 @@ def test_keyframes_without_features_keep_their_place() -> None:
     small = compacted(map)
     assert invariants.problems(small) == []
     assert small.keyframes.n_features.tolist() == [0, 0, *map.keyframes.n_features[4:].tolist()]
+
+
+def test_squeezed_in_place_a_map_loses_its_dead_rows_and_nothing_else() -> None:
+    map = room_map(n_keyframes=9)
+    for keyframe in (3, 4, 7):
+        map.remove_keyframe(keyframe)
+    map.remove_points(map.alive_points[::5])
+    small, poses = compacted(map), [map.pose(k) for k in range(9)]
+    xyz = map.points.xyz.copy()
+    new_point = squeeze(map)
+    assert invariants.problems(map) == []
+    assert len(map.keyframes) == 9  # whoever keeps their numbers may go on to
+    np.testing.assert_array_equal([map.pose(k).t for k in range(9)], [T.t for T in poses])
+    assert len(map.points) == len(small.points)
+    for name in ("px", "desc", "point", "next"):
+        np.testing.assert_array_equal(getattr(map.features, name), getattr(small.features, name))
+    alive = new_point >= 0
+    np.testing.assert_array_equal(map.points.xyz[new_point[alive]], xyz[alive[:-1]])
+    seen = map.features_of(8)
+    map.add_keyframe(10**9, poses[8], seen, parent=8)
+    assert invariants.problems(map) == []
 
 
 # -- the same bytes ---------------------------------------------------------------------------------------------

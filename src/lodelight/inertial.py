@@ -23,10 +23,12 @@ from lodelight.geometry.se3 import SE3, level
 from lodelight.localization.berth import Berth
 from lodelight.localization.machine import Finder
 from lodelight.localization.tracker import Tracked, Tracker
+from lodelight.mapping.compact import squeeze
 from lodelight.mapping.keyframes import Candidate, Decision, Gate, gated
 from lodelight.mapping.light_anchor import LightAnchor
 from lodelight.mapping.local import LocalMapper
 from lodelight.mapping.map import Map
+from lodelight.mapping.places import Places
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, Imu, TagSighting
 from lodelight.odometry.flown import Flown
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
@@ -38,6 +40,7 @@ NEAR_TRACK_PX = 1.5  # a corner so near a track is the same point
 DEPTH_SIGMA = 0.02  # least relative deviation of a depth that the window gives a corner
 SEARCH = 2.0  # window in which map points are looked for around the odometry's pose, of a corner's own scale
 MIN_MATCHES = 20  # of map points, below which they do not tell a keyframe's place in the map
+DEAD, DEAD_ROWS = 0.25, 20_000  # share of the map's features, and how many, that are worth numbering the map anew
 LOST_KEYFRAMES = 3  # not found where they should be in a map that is only read: look for the next one everywhere
 
 
@@ -249,6 +252,26 @@ class InertialFront:
         self._reference, self._T_map_reference = keyframe, step.state.T_world_body
         self.flown.number[step.frame.t_ns] = keyframe
         return keyframe, decision
+
+    def squeeze(self, places: Places) -> None:
+        """Give back the room of what is dead in the map, once it is a quarter of it. From the thread that maps, which
+        alone keeps numbers of points from one frame to another."""
+        map = self.map
+        with map.lock:
+            alive = map.keyframes.alive
+            dead = len(map.features) - int(map.keyframes.n_features[alive].sum())
+            if dead < max(DEAD * len(map.features), DEAD_ROWS):
+                return
+            places.follow()  # it asks dead keyframes for their features once more
+            last = self.tracker.last
+            if last is not None:
+                last.point[:] = map.surviving(last.point)
+            new_point = squeeze(map)
+            if last is not None:
+                last.point[:] = new_point[last.point]
+            self._known = int(np.count_nonzero(new_point[: self._known] >= 0))
+            self.mapper.renumber(new_point)
+            self.flown.thin(alive, max(self.flown.number, default=0))
 
     def _candidate(self, step: OdometryStep, T_world_body: SE3, matched: Tracked) -> Candidate:
         """What gates ask about; the window has decided that there should be a keyframe."""

@@ -406,6 +406,8 @@ class Slam:
         if self.map.keyframes.alive[keyframe]:
             self.loops.process(keyframe, self.mapping.interrupted)
             self.tags.process(keyframe, self.mapping.interrupted)
+        if self.inertial is not None:
+            self.inertial.squeeze(self.loops.places)
         self.mapping_ms.append(clock.ms())
 
     def _candidate(self, tracked: Tracked) -> Candidate:

@@ -1,4 +1,4 @@
-"""A map without its dead rows, numbered anew without gaps, in the old order."""
+"""A map without its dead rows, numbered anew without gaps, in the old order: as a copy, or in place."""
 
 from __future__ import annotations
 
@@ -44,6 +44,23 @@ def compacted(map: Map) -> Map:
     # counted anew, since a keyframe without features may name a row that is gone
     first_feature[:] = np.cumsum(small.keyframes.n_features) - small.keyframes.n_features
     return small
+
+
+def squeeze(map: Map) -> Ints:
+    """Drop dead points and the features of dead keyframes, in place; keyframes keep their numbers.
+
+    Returns the new number of every old point, -1 where it is gone, and -1 at index -1: whoever keeps points must look
+    them up there. Under the map's lock, while nobody keeps rows of features.
+    """
+    k, f, p = map.keyframes, map.features, map.points
+    kept = k.alive[f.keyframe]
+    new_row, new_point = _numbers(kept), _numbers(p.alive)
+    f.keep(kept)
+    p.keep(p.alive)
+    f.point[:], f.next[:], p.head[:] = new_point[f.point], new_row[f.next], new_row[p.head]
+    k.n_features[~k.alive] = 0
+    k.first_feature[:] = np.cumsum(k.n_features) - k.n_features
+    return new_point
 
 
 def _heirs(parent: Ints, alive: Bools) -> Ints:

@@ -123,6 +123,10 @@ class LocalMapper:
             good[best[np.isfinite(relative[best])]] = True
         return good
 
+    def renumber(self, new_point: Ints) -> None:
+        """Points have other numbers: see `compact.squeeze`."""
+        self._young = [(born, _kept(new_point[points])) for born, points in self._young]
+
     # -- parts --------------------------------------------------------------------------------------------------
 
     def _cull_young_points(self, keyframe: int) -> None:
@@ -213,6 +217,10 @@ class LocalMapper:
     def _sigma_rad(self, octave: Ints) -> Array:
         out: Array = self.config.sigma_px / self.camera.focal_px * self.orb.scale(octave)
         return out
+
+
+def _kept(points: Ints) -> Ints:
+    return points[points >= 0]
 
 
 def points_at_depth(seen: Features) -> Array:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lodelight.types import AnyArray
+from lodelight.types import AnyArray, Bools
 
 
 class Table:
@@ -40,7 +40,7 @@ class Table:
         start, end = self._n, self._n + count
         for name, column in self._columns.items():
             if end > len(column):
-                grown = np.zeros((max(end, 2 * len(column)), *column.shape[1:]), column.dtype)
+                grown = np.zeros((max(end, len(column) + len(column) // 2), *column.shape[1:]), column.dtype)
                 grown[:start] = column[:start]
                 self._columns[name] = column = grown
             column[start:end] = values.pop(name, 0)
@@ -48,3 +48,9 @@ class Table:
             raise AttributeError(f"table has no column {', '.join(values)}")
         self._n = end
         return start
+
+    def keep(self, rows: Bools) -> None:
+        """Only these rows (n,), in their order; the room of the others is given back."""
+        for name, column in self._columns.items():
+            self._columns[name] = column[: self._n][rows]
+        self._n = int(np.count_nonzero(rows))
