@@ -53,7 +53,8 @@ def bundle_adjust(
 
 @dataclass
 class Linear:
-    """Normal equations at one state."""
+    """Normal equations at one state. W and chain_H, the largest part, are one array for both states: they are those of
+    the state that was linearized last."""
 
     chi2: Array
     U: Array
@@ -106,10 +107,10 @@ class Adjustment:
             as_f64(a[self.order]) for a in (all_.px, all_.sigma_px, all_.inv_depth, all_.sigma_inv_depth, all_.weight)
         )
         self.state, self.trial = (State(as_f64(q.R).copy(), as_f64(q.p).copy(), all_.xyz.copy()) for _ in range(2))
+        W = np.empty((n, 3, 6))
         self.linear, self.trial_linear = (
             Linear(
-                np.full(n, np.inf), np.empty((k, 6, 6)), np.empty((k, 6)), np.empty((m, 6)), np.empty((m, 3)),
-                np.empty((n, 3, 6)),
+                np.full(n, np.inf), np.empty((k, 6, 6)), np.empty((k, 6)), np.empty((m, 6)), np.empty((m, 3)), W
             )
             for _ in range(2)
         )  # fmt: skip
@@ -143,6 +144,7 @@ class Adjustment:
                         return
                     if self._linearize(self.trial, self.trial_linear, robust, self.linear.chi2) <= self.linear.cost:
                         break
+                    self._linearize(self.state, self.linear, robust, self.linear.chi2)
                 damping = max(10.0 * damping, DAMPING_START)
                 if damping > DAMPING_MAX:
                     return

@@ -126,8 +126,9 @@ class InertialAdjustment(Adjustment):
         self.place = place
         for state in (self.state, self.trial):
             state.rest = as_f64(self.chain.rest).copy()
+        chain_H = np.zeros((len(self.chain.before), 36, 36))
         for linear in (self.linear, self.trial_linear):
-            linear.chain_H = np.zeros((len(self.chain.before), 36, 36))
+            linear.chain_H = chain_H
             linear.chain_g = np.zeros((k, REST))
 
     def _coupled(self, poses: Bools, node: Ints) -> Bools:
