@@ -22,7 +22,7 @@ from lodelight.types import Array
 
 # Limits: half of what spoils a run, and above what good recordings of known rigs show (docs/doctor.md).
 OFFSET_MS, TURN_DEG, FOCAL, EPIPOLAR_PX, AIM_CM, REGION_PX = 3.5, 1.3, 0.018, 1.0, 1.0, 1.0
-SHIFT_CM, SQUARE_PX, ASPECT = 2.0, 1.0, 0.015
+SHIFT_CM, AXES_CM, SQUARE_PX, ASPECT = 2.0, 1.2, 1.0, 0.015
 DEPTH_PX, DEPTH_DEG = 2.5, 0.5
 SURE = 2.5  # sigmas that know how alike errors are (`findings.jackknifed`, `rims.beside`); others need four
 DEGREES = (40.0, 80.0)  # what a gyro in degrees shows over what vision does
@@ -227,16 +227,18 @@ def _turning(seen: Seen, rig: Rig, moves: list[Move]) -> list[Finding]:
     if any(f.level == "fault" for f in out):
         return out  # a lever would be found by what is wrong otherwise
     lever = lever_of(moves, seen.imu, rig.imu, rig.cameras[0], found)
-    if lever is not None:
-        shift_m, sigma_m = lever.told(0.01 * SHIFT_CM / 2.0)
-        out.append(
-            measured(
-                "IMU shift", 100 * shift_m, 100 * sigma_m, SHIFT_CM, "cm",
-                "cam0 sits on the IMU where the rig says, to {value:.1f} cm (+- {sigma:.1f})",
-                "extrinsics: cam0 sits {value:.1f} cm (+- {sigma:.1f}) beside where the rig says; "
-                "measure T_body_cam anew",
-            )
-        )  # fmt: skip
+    if lever is None:
+        text = "too few moves are known in metres, by depth or a pair, to tell where cam0 sits on the IMU"
+        return [*out, Finding("IMU shift", "note", text)]
+    shift_m, sigma_m = lever.told(0.01 * AXES_CM)
+    out.append(
+        measured(
+            "IMU shift", 100 * shift_m, 100 * sigma_m, SHIFT_CM, "cm",
+            "cam0 sits on the IMU where the rig says, to {value:.1f} cm (+- {sigma:.1f})",
+            "extrinsics: cam0 sits {value:.1f} cm (+- {sigma:.1f}) beside where the rig says; "
+            "measure T_body_cam anew", times=SURE,
+        )
+    )  # fmt: skip
     return out
 
 
