@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from corridors import MAPPING, ORB, OTHER, Corridor, walk
+from corridors import MAPPING, NOISE_PX, ORB, OTHER, Corridor, walk
 from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
 from lodelight.localization.backwards import Backwards
 from lodelight.localization.beside import ThreadedSearch
 from lodelight.localization.follower import n_temporary
+from lodelight.localization.growth import Growth
 from lodelight.localization.ladder import Ladder, LadderConfig
 from lodelight.localization.machine import Found
 from lodelight.localization.relocalize import Hint
 from lodelight.localization.second_look import SecondLookConfig
 from lodelight.localization.states import State, States, StatesConfig, Step
 from lodelight.localization.surroundings import Surroundings
+from lodelight.localization.temporary import TemporaryConfig, TemporaryPoints
 from lodelight.localization.tracked import Tracked
 
 S = 10**9
@@ -354,3 +358,25 @@ def test_a_carried_camera_is_moved_only_by_two_answers_in_a_row_that_agree():
     assert third is None
     assert np.linalg.norm(second[0].t - there.t) < 1e-9
     assert second[1] == "80 points found beside, twice alike"
+
+
+def test_a_pair_of_frames_makes_points_where_they_are_of_patches_as_large_as_their_distances_say():
+    corridor, rng = Corridor.built(0), np.random.default_rng(4)
+    overlay = TemporaryPoints(OTHER.cameras[0], ORB, TemporaryConfig(), NOISE_PX)
+    poses = [walk(5.0), walk(5.6)]
+    (before, _), (seen, which) = (corridor.seen(OTHER, pose, rng) for pose in poses)
+    unlike = np.arange(len(seen)) % 2 == 1
+    octave = np.where(unlike, (seen.octave + 4) % ORB.n_levels, seen.octave).astype(np.int32)
+    frames = [
+        Tracked(i * S, features, pose, np.eye(6), np.full(len(features), -1, np.int32), 0)
+        for i, (features, pose) in enumerate(zip((before, replace(seen, octave=octave)), poses, strict=True))
+    ]
+    overlay.remember(frames[0], well=True)
+    assert Growth(overlay).grow(frames[1], np.zeros(0)) > 0
+    made = overlay.measured(frames[1].temporary)
+    assert made.sum() > 50
+    assert made[unlike].mean() < 0.3 * made[~unlike].mean()  # levels are whole numbers: some of four are three
+    made &= ~unlike
+    xyz = overlay.table.xyz[frames[1].temporary[made]]
+    away_m = np.linalg.norm(corridor.xyz[which[made]] - poses[1].t, axis=1)
+    assert np.median(np.linalg.norm(xyz - corridor.xyz[which[made]], axis=1) / away_m) < 0.05

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from conftest import shared_data
+from corridors import MAPPING, Corridor, walk
 from lodelight.features.features import Features
 from lodelight.geometry.se3 import SE3
 from lodelight.io.sources import open_source
 from lodelight.localization.machine import Found
 from lodelight.localization.relocalize import Hint, Relocalizer, RelocalizerConfig
+from lodelight.mapping.verification import Refusal, Verifier
 from single_frames import ORB, map_of, shots
 
 
@@ -92,3 +94,20 @@ def test_relocalization_repeats_its_bytes(kitchen):
     answers = [Relocalizer(map, ORB).find(queries[3].seen) for _ in range(2)]
     assert answers[0].T_world_body.matrix.tobytes() == answers[1].T_world_body.matrix.tobytes()
     np.testing.assert_array_equal(answers[0].point, answers[1].point)
+
+
+def test_a_frame_is_located_by_what_any_keyframe_around_saw_not_the_most_similar_alone():
+    corridor, rng = Corridor.built(0), np.random.default_rng(2)
+    map = corridor.mapped(0)
+    keyframe = int(np.argmin(np.linalg.norm(map.keyframes.p - walk(8.5).t, axis=1)))
+    seen, which = corridor.seen(MAPPING, walk(10.1), rng)
+    there = map.points.xyz[map.points_of(keyframe)]
+    unseen = ~np.any(np.all(corridor.xyz[which][:, None] == there[None], axis=2), axis=1)
+    seen = seen.take(np.append(np.flatnonzero(~unseen)[:5], np.flatnonzero(unseen)))
+    found = {}
+    for whole_place in (False, True):
+        verifier = Verifier(map, ORB, 1.0, whole_place=whole_place, min_agreeing=6)
+        found[whole_place] = verifier.locate(seen, keyframe, verifier.neighbourhood(keyframe))
+    assert isinstance(found[False], Refusal)
+    assert len(found[True]) > 40
+    assert np.linalg.norm(found[True].T_world_body.t - walk(10.1).t) < 0.02

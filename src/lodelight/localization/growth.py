@@ -10,7 +10,7 @@ from scipy.special import gammaincinv
 
 from lodelight.features.epipolar import match_epipolar
 from lodelight.features.features import Features
-from lodelight.geometry.triangulate import CHI2_PAIR, triangulate_rays
+from lodelight.geometry.triangulate import triangulate_rays
 from lodelight.localization.temporary import Past, TemporaryPoints
 from lodelight.localization.tracker import CLOSE_SIGMA, Tracked
 from lodelight.types import AnyArray, Array, Bools, Ints
@@ -152,7 +152,7 @@ class Growth:
         distance_b = np.linalg.norm(made.xyz - T_world_b.t, axis=1)
         expected = distance_b / np.maximum(distance_a, 1e-9)  # a patch half as far away is twice as large
         size = self.orb.scale(a.octave[ia]) / self.orb.scale(b.octave[ib])
-        good = made.in_front & (made.chi2 < CHI2_PAIR) & (made.parallax >= least)
+        good = made.in_front & (made.parallax >= least)  # that they meet is how they were matched
         good &= made.relative_sigma < self.config.max_relative_sigma
         good &= np.abs(np.log(np.maximum(size, 1e-9) / np.maximum(expected, 1e-9))) < math.log(SAME_SCALE)
         ia, ib = ia[good], ib[good]

@@ -22,6 +22,7 @@ from lodelight.types import Array, Ints
 class RelocalizerConfig:
     """sigma_px : noise of a corner at the finest octave
     candidates : places looked at, the most similar first
+    min_agreeing : matches that fit a first pose, around which the others are looked for. By chance 4 or 5 of a dozen do
     min_inliers, min_coverage : map points found, and share of the image's cells with points that have one found,
         below which an answer is not believed. Wrong places of real rooms reach 10 points once in 10,000 trials
         (docs/places-and-loops.md); a poster that hangs in two rooms reaches more, but in few cells.
@@ -31,7 +32,8 @@ class RelocalizerConfig:
     """
 
     sigma_px: float = 1.0
-    candidates: int = 5
+    candidates: int = 12
+    min_agreeing: int = 6
     min_inliers: int = 30
     min_coverage: float = 0.35
     rival: float = 0.5
@@ -82,7 +84,7 @@ class Relocalizer:
         self.config = config or RelocalizerConfig()
         self.places = places or Places(map)
         self.T_body_cam = (spec or map.rig.cameras[0]).T_body_cam
-        self._verifier = Verifier(map, orb, self.config.sigma_px, spec)
+        self._verifier = Verifier(map, orb, self.config.sigma_px, spec, True, self.config.min_agreeing)
 
     def find(self, seen: Features, hint: Hint | None = None) -> Found | str:
         """Pose of a frame in the map and what it shows of it, or why none is believed.
@@ -104,11 +106,10 @@ class Relocalizer:
             return self._rival(believed) or self._answer(seen, *believed[0])
 
     def _candidates(self, seen: Features, hint: Hint | None) -> Ints:
-        if hint is None:
-            return self.places.candidates(seen.desc, limit=self.config.candidates)
-        near = self._keyframes_near(hint)
-        score, _ = self.places.similarity(seen.desc)
-        return near[np.argsort(-score[near], kind="stable")][: self.config.candidates]
+        far = None
+        if hint is not None:
+            far = np.setdiff1d(np.arange(len(self.map.keyframes)), self._keyframes_near(hint))
+        return self.places.candidates(seen.desc, self.config.candidates, far)
 
     def _keyframes_near(self, hint: Hint) -> Ints:
         """Keyframes whose cameras may be within reach of a hint's, and look where it looks."""

@@ -129,9 +129,9 @@ class Places:
         words, shares = self.describe(desc)
         return compare(words, shares, self._lists, self._keyframe_of, self._share_of, len(self._indexed))
 
-    def candidates(self, desc: Words, limit: int) -> Ints:
-        """Keyframes that look most like descriptors (N, 4), one of each place, the best place first."""
-        return self.best(*self.similarity(desc), limit=limit)
+    def candidates(self, desc: Words, limit: int, excluded: AnyArray | None = None) -> Ints:
+        """Keyframes that look most like descriptors (N, 4), as `best` chooses them."""
+        return self.best(*self.similarity(desc), limit, excluded)
 
     def best(
         self, score: ArrayF32, common: Ints, limit: int, excluded: AnyArray | None = None, min_score: float = 0.0

@@ -20,7 +20,7 @@ from lodelight.geometry.se3 import SE3
 from lodelight.mapping.map import Map
 from lodelight.mapping.sight import in_sight, points_of_keyframes
 from lodelight.rig import CameraSpec
-from lodelight.types import AnyArray, Array, Ints
+from lodelight.types import AnyArray, Array, ArrayF32, Ints, Words
 
 MIN_AGREEING = 10  # matches, and of them those that fit one pose, below which it is not worth looking on
 MATCH_HAMMING = 64
@@ -73,15 +73,22 @@ class Verifier:
 
     orb : what the features were extracted with; sigma_px : noise of a corner at the finest octave
     spec : the camera of the images, where it is not the map's
+    whole_place : a first pose is drawn from matches with all points around, not with what one keyframe saw alone
+    min_agreeing : matches that must fit a first pose for it to be worth looking on
     """
 
-    def __init__(self, map: Map, orb: OrbConfig, sigma_px: float, spec: CameraSpec | None = None) -> None:
+    def __init__(
+        self, map: Map, orb: OrbConfig, sigma_px: float, spec: CameraSpec | None = None, whole_place: bool = False,
+        min_agreeing: int = MIN_AGREEING,
+    ) -> None:  # fmt: skip
         spec = spec or map.rig.cameras[0]
         self.map = map
         self.orb = orb
         self.sigma_px = sigma_px
         self.camera = spec.camera
         self.T_body_cam = spec.T_body_cam
+        self.whole_place = whole_place
+        self.min_agreeing = min_agreeing
 
     def neighbourhood(self, keyframe: int, excluded: AnyArray | None = None, size: int = 10) -> Ints:
         """A keyframe and those that share most points with it, without the excluded ones."""
@@ -97,10 +104,11 @@ class Verifier:
         The answer is as sure as its inliers are many, spread, and a large part of what should be visible; the caller
         sets those bounds. Source: science note B2.
         """
-        pose = self._draw(seen, keyframe)
+        points = points_of_keyframes(self.map, neighbourhood)
+        matches = self._matches_place(seen, points) if self.whole_place else self._matches(seen, keyframe)
+        pose = self._draw(seen, *matches)
         if isinstance(pose, Refusal):
             return pose
-        points = points_of_keyframes(self.map, neighbourhood)
         index = FeatureIndex(seen, self.camera.width, self.camera.height)
         for window_px in WINDOWS_PX:
             sight = in_sight(self.map, points, pose, self.T_body_cam, self.camera, self.orb)
@@ -135,21 +143,35 @@ class Verifier:
         near = off_px < window_px * self.orb.scale(seen.octave[located.feature]) + np.minimum(2.0 * blur_px, window_px)
         return float(np.mean(near & visible))
 
-    def _draw(self, seen: Features, keyframe: int) -> SE3 | Refusal:
-        """A first pose, from matches of descriptors with those of one keyframe."""
+    def _matches(self, seen: Features, keyframe: int) -> tuple[Ints, Ints]:
+        """(K,) features of an image, and the points that look like them, by descriptors as one keyframe saw them."""
         there, point = self.map.features_of(keyframe), self.map.points_of(keyframe)
         there, point = there.take(point >= 0), point[point >= 0]
-        match = match_descriptors(there.desc, seen.desc, MATCH_HAMMING, MATCH_RATIO)
+        return self._alike(seen, there.desc, there.angle, point)
+
+    def _matches_place(self, seen: Features, points: Ints) -> tuple[Ints, Ints]:
+        """As `_matches`, of points by their own descriptors: what any of the keyframes around saw, each once."""
+        angle = self.map.features.angle[self.map.points.head[points]]
+        return self._alike(seen, self.map.points.desc[points], angle, points)
+
+    def _alike(self, seen: Features, desc: Words, angle: ArrayF32, point: Ints) -> tuple[Ints, Ints]:
+        match = match_descriptors(desc, seen.desc, MATCH_HAMMING, MATCH_RATIO)
         hit = np.flatnonzero(match >= 0)
-        hit = hit[consistent_turn(there.angle[hit], seen.angle[match[hit]])] if len(hit) else hit
-        if len(hit) < MIN_AGREEING:
-            return Refusal(f"{len(hit)} descriptors match, {MIN_AGREEING} are needed")
-        seen, point = seen.take(match[hit]), point[hit]
+        hit = hit[consistent_turn(angle[hit], seen.angle[match[hit]])]
+        return match[hit], point[hit]
+
+    def _draw(self, seen: Features, feature: Ints, point: Ints) -> SE3 | Refusal:
+        """A first pose, from matches (K,) of features and points of which many may be wrong."""
+        if len(feature) < self.min_agreeing:
+            return Refusal(f"{len(feature)} descriptors match, {self.min_agreeing} are needed")
+        seen = seen.take(feature)
         sigma_rad = np.hypot(self._sigma_px(seen) / self.camera.focal_px, PARALLAX * self._depth_sigma(point))
         found = ransac_pnp(seen.ray, self.map.points.xyz[point], sigma_rad, seed=0)
         agreeing = 0 if found is None else int(found[1].sum())
-        if found is None or agreeing < MIN_AGREEING:
-            return Refusal(f"{agreeing} of {len(hit)} matches fit one pose, {MIN_AGREEING} are needed", agreeing)
+        if found is None or agreeing < self.min_agreeing:
+            return Refusal(
+                f"{agreeing} of {len(feature)} matches fit one pose, {self.min_agreeing} are needed", agreeing
+            )
         T_world_cam, inliers = found
         start = T_world_cam @ self.T_body_cam.inverse()
         return self._solve(start, seen.take(inliers), point[inliers]).T_world_body
