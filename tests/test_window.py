@@ -295,17 +295,22 @@ def test_what_cannot_be_used_is_refused_in_words():
             window.add_frame(int(made.frame_ns[3]), made.samples, observations, views)
 
 
-def test_the_window_agrees_with_a_batch_solution_by_gtsam():
-    """The same keyframes, tracks and IMU as points in space, projection and IMU factors: 0.013 sigma apart.
+@pytest.mark.parametrize("tags", [0, 24])
+def test_the_window_agrees_with_a_batch_solution_by_gtsam(tags):
+    """The same keyframes, tracks and IMU as points in space, projection and IMU factors: 0.013 sigma apart; and tags,
+    surveyed to 5 mm and 1 degree, as poses with a prior and their corners as functions of body and tag.
 
     What is believed of a point's depth is a sphere there and a ray here, of the same width.
 
     The noise is a third of what is assumed, so that no robust kernel has anything to do.
     """
     gtsam = pytest.importorskip("gtsam", reason="needs GTSAM 4.3: pip install lodelight[reference]")
-    made = scene(12, gait="drone", duration_s=2.0, rate_hz=4.0, cameras=1, max_tracks=60)
+    made = scene(12, gait="drone", duration_s=2.0, rate_hz=4.0, cameras=1, max_tracks=60, tags=tags)
     window = Window(made.rig, WindowConfig(keyframes=20, reject_px=50.0))
-    tracks = {}
+    tracks, sighted = {}, []
+    survey = np.diag(np.square([0.02] * 3 + [0.005] * 3))
+    for name, T in made.tags.items():
+        window.declare(Tag(name, CORNERS, T, survey))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     start_state = perturbed(made.truth(int(made.frame_ns[0])), START, made.rng)
     spec, fitted = made.rig.imu, made.rig.cameras[0]
@@ -313,16 +318,20 @@ def test_the_window_agrees_with_a_batch_solution_by_gtsam():
     lens = gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, k1, k2, p1, p2)
     mount = gtsam.Pose3(gtsam.Rot3(fitted.T_body_cam.R), fitted.T_body_cam.t)
     for i, t_ns in enumerate(made.frame_ns.tolist()):
-        observations, _ = look(made, t_ns)
+        observations, views = look(made, t_ns)
         observations = replace(observations, sigma_px=3.0 * observations.sigma_px)
+        views = [replace(view, sigma_px=3.0 * view.sigma_px) for view in views]
+        sighted += [(i, view) for view in views]
         for track, px in zip(observations.track.tolist(), observations.px, strict=True):
             tracks.setdefault(track, []).append((i, px))
         if i == 0:
-            window.start(start_state, START, observations)
+            window.start(start_state, START, observations, views)
             continue
-        window.add_frame(t_ns, samples_near(made.samples, window.newest.t_ns, t_ns), observations, keyframe=True)
+        samples = samples_near(made.samples, window.newest.t_ns, t_ns)
+        window.add_frame(t_ns, samples, observations, views, keyframe=True)
     for _ in range(3):
         assert window.solve(30).ok
+    assert all(seen.use for frame in window.frames for seen in frame.tags)
     X, V, B, L = (lambda k, c=c: gtsam.symbol(c, k) for c in "xvbl")
     for i, state in enumerate(window.keyframes()):
         T = state.T_world_body
@@ -367,6 +376,14 @@ def test_the_window_agrees_with_a_batch_solution_by_gtsam():
         graph.add(gtsam.PriorFactorPoint3(L(track), xyz, isotropic(3, SIGMA_INV_DEPTH * away**2)))
         for i, px in tracks[track]:
             graph.add(gtsam.GenericProjectionFactorCal3DS2(px, isotropic(2, 3.0), X(i), L(track), lens, mount))
+    T_key = {name: gtsam.symbol("t", k) for k, name in enumerate(dict.fromkeys(view.id for _, view in sighted))}
+    for name, key in T_key.items():
+        T = gtsam.Pose3(gtsam.Rot3(made.tags[name].R), made.tags[name].t)
+        values.insert(key, T)
+        graph.add(gtsam.PriorFactorPose3(key, T, gaussian(survey)))  # the same on either axes: it is round
+    for i, view in sighted:
+        graph.add(corners_factor(gtsam, X(i), T_key[view.id], view, fitted))
+    assert bool(sighted) is bool(tags)
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(100)
     theirs = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
@@ -383,3 +400,26 @@ def test_the_window_agrees_with_a_batch_solution_by_gtsam():
     np.testing.assert_allclose(
         deviation[3:6], np.sqrt(np.diag(pose.rotation().matrix() @ P[3:, 3:] @ pose.rotation().matrix().T)), rtol=2e-3
     )
+
+
+def corners_factor(gtsam, key_body, key_tag, view, spec):
+    """Corners of a tag in an image, with central differences in GTSAM's chart."""
+
+    def residual(body, tag):
+        xyz = SE3(tag.rotation().matrix(), np.asarray(tag.translation())) @ CORNERS
+        T_world_cam = SE3(body.rotation().matrix(), np.asarray(body.translation())) @ spec.T_body_cam
+        return (spec.camera.project(T_world_cam.inverse() @ xyz)[0] - view.corners_px).ravel()
+
+    def evaluate(this, values, jacobians):
+        poses = [values.atPose3(key_body), values.atPose3(key_tag)]
+        if jacobians is not None:
+            for at in (0, 1):
+                columns = []
+                for d in 1e-6 * np.eye(6):
+                    moved = [[p.retract(sign * d) if k == at else p for k, p in enumerate(poses)] for sign in (1, -1)]
+                    columns.append((residual(*moved[0]) - residual(*moved[1])) / 2e-6)
+                jacobians[at] = np.asfortranarray(np.column_stack(columns))
+        return residual(*poses)
+
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(view.sigma_px, 2))
+    return gtsam.CustomFactor(noise, [key_body, key_tag], evaluate)
