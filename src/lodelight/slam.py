@@ -353,6 +353,9 @@ class Slam:
             flown = FlownKeyframe(located, located.keyframe, len(self.path) - 1)
             # the first of all must be there before another frame can hang on it
             self.mapping.submit(self._put(flown) if located.reference < 0 else flown)
+        elif not self.localization_only:
+            with self.map.lock:
+                self._note(located, located.reference, located.T_reference_body, own=False)
         T_world_body, covariance = self.tags.world(estimate.T_world_body), estimate.covariance
         details = {**estimate.details, "aligned": float(self.tags.aligned)}
         if self.tags.T_world_map is not None:
@@ -390,12 +393,19 @@ class Slam:
         before = None if alone else (node.reference, node.T_reference_body)
         self.path[flown.at] = PathNode(node.t_ns, keyframe, SE3.identity(), before)
         with self.map.lock:
-            elsewhere = self.tags.note(
-                located.tags, keyframe, SE3.identity(), located.estimate.covariance, own=True
-            )  # fmt: skip
-            if located.tags and self.tags.aligned:
-                self._tie = self.tags.surveys(), elsewhere
+            self._note(located, keyframe, SE3.identity(), own=True)
         return keyframe
+
+    def _note(self, located: Located, reference: int, T_reference_body: SE3, own: bool) -> None:
+        """What a frame of the inertial half saw of tags; the window is told of surveyed ones."""
+        if not located.tags:
+            return
+        window = self.config.inertial.window
+        beyond = np.diag(np.repeat([window.tag_gate_rad, window.tag_gate_m], 3) ** 2)  # as in the window's test
+        covariance = located.estimate.covariance + beyond
+        elsewhere = self.tags.note(located.tags, reference, T_reference_body, covariance, own)
+        if self.tags.aligned:
+            self._tie = self.tags.surveys(), elsewhere
 
     def _map(self, job: MappingJob) -> None:
         clock = Stopwatch()
