@@ -99,6 +99,25 @@ def test_an_imu_of_another_unit_or_sign_is_named(change, named):
         run(motion, 1, change=lambda m: change(m) if isinstance(m, Imu) else m)
 
 
+def test_a_push_before_the_start_is_not_taken_for_a_bias():
+    """1 m/s^2 that is no motion over the first 0.6 s, as of a drone that leaves the ground: later images are used."""
+    motion = flight(3.0, seed=0)
+    push = np.array([0.0, 1.0, 0.0])
+
+    def change(m):
+        pushed = isinstance(m, Imu) and m.t_ns < START_NS + 600_000_000
+        return dataclasses.replace(m, accel=m.accel + push) if pushed else m
+
+    steps, odometry, _ = run(motion, 1, change=change)
+    started = next(s for s in steps if s.status == "tracking")
+    assert any("are likely" in s.why for s in steps[: steps.index(started)])
+    assert seconds(started) <= 2.3
+    assert odometry.restarts == 0
+    true = motion.at_ns(np.array([started.frame.t_ns]))
+    v_body = started.state.T_world_body.R.T @ started.state.v_world
+    assert np.linalg.norm(v_body - true.R_world_body[0].T @ true.v_world[0]) < 0.1
+
+
 def test_without_imu_it_says_so_and_after_a_hole_it_starts_again_where_it_was():
     motion = flight(5.0, seed=3)
     hole = (START_NS + 2_000_000_000, START_NS + 2_800_000_000)

@@ -32,6 +32,7 @@ LEAST_NOISE = 0.5  # of a patch, of the median of all
 LEAST_GRADIENT2 = 1e-8  # and likewise of the median noise
 LENS_PATCHES, LENS_REACH_RAD = 12, 0.44  # a track that moved so far is off by something else
 LEAST_WINDOW_PX, MOST_WINDOW_PX = 9, 21
+CONTRAST_GREY = 30.0  # deviation of grey values of a patch at full contrast
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class KltConfig:
     back_px : a track followed back must return to within this
     min_quality : of a new corner, as a share of a good one's (the 90 % quantile of the best of every cell)
     min_contrast : least smaller eigenvalue of a corner's gradients, in squared grey values a pixel: below is noise
-    equalize : contrast limit of the local equalisation, 0 = none
+    flat_grey : deviation of grey values of a patch that is raised to half of full contrast; 0 = images as they are
     sigma_px : noise of a track; bound : outlier bound of the common motion in units of it
     wander : over ten frames and more a track leaves its point by so many times what single steps would add up to,
         measured on rendered images (docs/inertial.md)
@@ -56,7 +57,7 @@ class KltConfig:
     back_px: float = 0.7
     min_quality: float = 0.05
     min_contrast: float = 4.0
-    equalize: float = 3.0
+    flat_grey: float = 12.0
     sigma_px: float = 0.5
     bound: float = 3.0
     wander: float = 1.5
@@ -142,7 +143,6 @@ class KltTracker:
         self._window_px = min(max(2 * half + 1, LEAST_WINDOW_PX), MOST_WINDOW_PX)
         self._lens_px = self.config.lens_rad * focal_px
         self._seed = seed + 1
-        self._equalizer = cv2.createCLAHE(self.config.equalize, (8, 8)) if self.config.equalize > 0 else None
         self._next_id = 0
         self._last: Bytes | None = None
         self._tracks: Tracks | None = None
@@ -199,7 +199,18 @@ class KltTracker:
         return 2.0 * self._lens_px**2 * share * max(followed / LENS_PATCHES, 1.0)
 
     def _equalized(self, image: Bytes) -> Bytes:
-        return image if self._equalizer is None else np.asarray(self._equalizer.apply(image), np.uint8)
+        """Its difference from the mean around, over the deviation around.
+
+        The lens darkens an image towards its rim, and that does not move with what is seen: a patch of slope g of its
+        own and a slope v of the lens's is followed short by v^2 / (g^2 + v^2) of its way. The mean takes it out.
+        """
+        if self.config.flat_grey <= 0.0:
+            return image
+        side = (2 * self._window_px + 1, 2 * self._window_px + 1)
+        mean, mean2 = (np.asarray(f(image, cv2.CV_32F, side), np.float32) for f in (cv2.boxFilter, cv2.sqrBoxFilter))
+        out = np.empty(image.shape, np.uint8)
+        _contrast(image, mean, mean2, self.config.flat_grey, out)
+        return out
 
     def _follow(
         self, image: Bytes, t_ns: int, R_now_last: Array | None, sigma_rotation: float
@@ -289,11 +300,20 @@ class KltTracker:
         """Tracks with their pixels in camera 1, and the inverse depth both cameras give."""
         assert self.right is not None
         _check_size(right, self.right)
+        right, expected = self._equalized(right), self._expected_inv_depth(tracks)
+        measured = self._in_right(left, right, tracks, expected)
+        if not expected.any() and measured.stereo.any():  # the first: what is as far as most is found from there
+            usual = np.median(measured.inv_depth[measured.stereo])
+            measured = self._in_right(left, right, tracks, np.full(len(tracks), usual))
+        return measured
+
+    def _in_right(self, left: Bytes, right: Bytes, tracks: Tracks, inv_depth: Array) -> Tracks:
+        """Tracks as found from where points of inv_depth (N,), 1/m, would be."""
+        assert self.right is not None
         T = self.right.T_body_cam.inverse() @ self.spec.T_body_cam
-        inv_depth = self._expected_inv_depth(tracks)
         guess, seen = self.right.camera.project(tracks.ray @ T.R.T + (inv_depth * tracks.ray[:, 2])[:, None] * T.t)
         start = np.where(seen[:, None], guess, tracks.px).astype(np.float32)
-        px, found, patch = self._flow(left, self._equalized(right), tracks.px, start)
+        px, found, patch = self._flow(left, right, tracks.px, start)
         found &= self.right.camera.inside(px.astype(np.float64), 1.0)
         ray, real = self.right.camera.unproject(px.astype(np.float64))
         rows = np.flatnonzero(found & real)
@@ -325,6 +345,18 @@ class KltTracker:
         known = last.inv_depth[row_last] > 0
         out[row[known]] = last.inv_depth[row_last[known]]
         return out
+
+
+@kernel
+def _contrast(image: Bytes, mean: ArrayF32, mean2: ArrayF32, flat: float, out: Bytes) -> None:
+    gain, floor, grey = np.float32(CONTRAST_GREY), np.float32(flat), np.float32(128.5)
+    least, most = np.float32(0.0), np.float32(255.0)
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            m = mean[i, j]
+            deviation = np.sqrt(max(mean2[i, j] - m * m, least))
+            value = grey + gain * (np.float32(image[i, j]) - m) / (deviation + floor)
+            out[i, j] = np.uint8(np.int32(min(max(value, least), most)))
 
 
 def _check_size(image: Bytes, spec: CameraSpec) -> None:

@@ -29,6 +29,7 @@ from lodelight.types import AnyArray, Array
 GRAVITY_M_S2 = 9.81
 ALIGNED_VIEWS = 12
 SIGN_CHI2 = 16.0  # by so much must the accelerometer's turned sign fit better
+BIAS_CHI2 = 16.27  # 99.9 % of three degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -124,11 +125,12 @@ class Starter:
         self.focal_px = focal_px
         self.metric = metric
         self.doubted = False  # images and IMU were found to contradict each other
+        self._odd_ns: int | None = None  # the last image when a start first believed in a bias that is not likely
         self.views: list[StartView] = []
         self.imu: list[ImuSamples] = []  # imu[i] from views[i] to views[i + 1]
 
     def reset(self) -> None:
-        self.views, self.imu = [], []
+        self.views, self.imu, self._odd_ns = [], [], None
 
     def anew(self) -> Starter:
         """Another one, that has seen nothing."""
@@ -252,8 +254,23 @@ class Starter:
             self._refuse_turned_sign(rows, sigma_ray, bias, found)
         if isinstance(found, str):
             return found
-        missing = self._missing(found, motions)
+        missing = self._missing(found, motions) or self._unlikely(found)
         return missing or self._started(found, motions)
+
+    def _unlikely(self, found: Alignment) -> str:
+        """What speaks against a start that believes in a bias beyond all expectation: a body that leaves the ground,
+        or that was pushed, shows what is neither motion nor bias. So later images are waited for; a bias that all of
+        those show is one."""
+        c, now_ns = self.config, self.views[-1].t_ns
+        bias = float(np.linalg.norm(found.bias_accel))
+        if bias**2 <= BIAS_CHI2 * c.bias_accel**2:
+            return ""
+        self._odd_ns = now_ns if self._odd_ns is None else self._odd_ns
+        if self.views[0].t_ns > self._odd_ns:
+            return ""
+        while len(self.views) > 2 and self._span_s >= self._without_tags_s:
+            del self.views[0], self.imu[0]
+        return f"images and IMU would fit with a bias of {bias:.2f} m/s^2, {4.0 * c.bias_accel:.1f} at most are likely"
 
     @staticmethod
     def _sigma_scale(found: Alignment, motions: list[Preintegration]) -> float:
