@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from inertial_scenes import START, look, perturbed, samples_near, scene
-from lodelight.estimation import window_kernels as kernels
 from lodelight.estimation.window import Window
 from lodelight.estimation.window_build import build
 from lodelight.estimation.window_problem import Problem, Unknowns
+from lodelight.estimation.window_visual import visual_terms
 from lodelight.geometry.so3 import so3_exp
 
 STEP_PX2 = 0.04  # of a track from one frame to the next
@@ -37,7 +37,7 @@ def seen(problem: Problem, x: Unknowns, robust: bool):
     """Cost and slope of the sightings alone, all else left out."""
     out, s = problem._allocated(), problem.sightings
     out.H[:], out.g[:] = 0.0, 0.0
-    out.cost, _ = kernels.visual_terms(
+    out.cost, _ = visual_terms(
         x.frames, x.frames, problem.motion, problem.models, problem.params, x.mounts, x.mounts, 0.0, problem.base,
         x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth, s.shift_s,
         problem.active, robust, out.chi2, problem.usual_inv_depth, problem.pose_at, -1, -1, True, out.H, out.g, out.V,

@@ -12,7 +12,7 @@ from inertial_scenes import CORNERS, START, fly, look, nees, perturbed, samples_
 from lodelight.errors import CalibrationError, ConfigError, SourceError
 from lodelight.estimation.marginalization import Prior, schur
 from lodelight.estimation.window import Observations, StartSigma, Tag, Window, WindowConfig
-from lodelight.estimation.window_kernels import SIGMA_INV_DEPTH
+from lodelight.estimation.window_visual import SIGMA_INV_DEPTH
 from lodelight.geometry.se3 import SE3
 
 

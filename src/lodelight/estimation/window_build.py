@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lodelight.estimation import window_kernels as kernels
 from lodelight.estimation.marginalization import Key
 from lodelight.estimation.window_frames import SeenTag, WindowFrame, gathered
+from lodelight.estimation.window_landmarks import place_landmarks, world_landmarks
 from lodelight.estimation.window_problem import Belief, Problem, Sightings, TagSightings, Unknowns
 from lodelight.types import AnyArray, Array, Bools, Ints
 
@@ -151,7 +151,7 @@ def _placed(window: Window, s: Sightings, x: Array, motion: Array, models: Ints)
     sure = window.landmark_sigma < 0.25 * window.landmark_inv_depth
     usual = float(np.median(window.landmark_inv_depth[sure])) if sure.sum() >= MANY else DEFAULT_INV_DEPTH
     base, landmark, parallax = np.empty((M, 3, 3)), np.empty((M, 3)), np.empty(M)
-    kernels.place_landmarks(
+    place_landmarks(
         x, motion, models, window.mounts, float(window.offset_s[0]), s.rays, s.start, s.frame, s.camera, s.inv_depth,
         s.shift_s, world, known, usual, base, landmark, parallax,
     )  # fmt: skip
@@ -167,7 +167,7 @@ def store(window: Window, problem: Problem, rows: Rows) -> Bools:
     for number, row in zip(problem.keys_tag, x.tags, strict=True):
         window.tag_states.states[number].row = row.copy()
     world = np.empty((len(s.track), 4))
-    kernels.world_landmarks(
+    world_landmarks(
         x.frames, problem.motion, x.mounts, float(x.offset_s[0]), s.start, s.frame, s.camera, s.shift_s,
         problem.base, x.landmarks, world,
     )  # fmt: skip

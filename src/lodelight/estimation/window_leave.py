@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lodelight.estimation import window_kernels as kernels
 from lodelight.estimation.marginalization import Key, Prior, schur
 from lodelight.estimation.window_build import Leaving, build
 from lodelight.estimation.window_frames import WindowFrame, gathered, joined_imu
+from lodelight.estimation.window_poses import chart_difference
 from lodelight.estimation.window_problem import Belief, Problem
 from lodelight.estimation.window_tags import inverse
 from lodelight.estimation.window_types import Departed, Landmarks
@@ -119,7 +119,7 @@ def forget_tags(window: Window) -> None:
         assert lin is not None
         if state.belief is not None:
             d = np.empty((1, 6))
-            kernels.chart_difference(lin[None], state.belief.mean[None], d)
+            chart_difference(lin[None], state.belief.mean[None], d)
             span = window.prior.spans()["tag", number]
             window.prior.H[span, span] += state.belief.information
             window.prior.g[span] += state.belief.information @ d[0]

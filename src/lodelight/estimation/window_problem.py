@@ -1,4 +1,12 @@
-"""The window at one instant as plain arrays, and Levenberg-Marquardt on them."""
+"""The window at one instant as plain arrays, and Levenberg-Marquardt on them.
+
+Order of the unknowns: (v, bg, ba) of every frame, then (theta, p) of every frame, then the mountings of the cameras and
+the time offset where they are estimated, then tags. Velocities and biases couple to their neighbours only; first in the
+order they are eliminated at little cost, as rows of the factor that are mostly zero are skipped.
+
+First-estimate Jacobians: a state that the prior knows is linearized for ever where the prior was made (`lin`); the
+residuals are those of the current state (`x`). Without that, yaw would seem to be measured where it is not (C6).
+"""
 
 from __future__ import annotations
 
@@ -8,8 +16,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lodelight.estimation import window_kernels as kernels
 from lodelight.estimation.marginalization import Key, Prior
+from lodelight.estimation.window_elimination import eliminate_landmarks, marginal_covariance, step
+from lodelight.estimation.window_poses import chart_difference
+from lodelight.estimation.window_terms import state_terms, tag_terms
+from lodelight.estimation.window_visual import visual_terms
 from lodelight.types import AnyArray, Array, Bools, Ints
 
 DAMPING_START, DAMPING_MAX = 1e-12, 1e4  # at first too little to be seen in the covariance
@@ -199,18 +210,18 @@ class Problem:
         F, C = len(x.frames), len(x.mounts)
         out = np.zeros(self.n)
         d = np.empty((F, 15))
-        kernels.chart_difference(x.frames, self.lin_frames(x), d)
+        chart_difference(x.frames, self.lin_frames(x), d)
         out[: self.pose_at] = d[:, 6:].ravel()
         out[self.pose_at : 15 * F] = d[:, :6].ravel()
         if self.calibrate_mounts and self.frozen_mounts:
             d = np.empty((C, 6))
-            kernels.chart_difference(x.mounts, self.lin.mounts, d)
+            chart_difference(x.mounts, self.lin.mounts, d)
             out[self.mount_at : self.mount_at + 6 * C] = d.ravel()
         if self.calibrate_offset and self.frozen_offset:
             out[self.offset_at] = x.offset_s[0] - self.lin.offset_s[0]
         if len(x.tags):
             d = np.empty((len(x.tags), 6))
-            kernels.chart_difference(x.tags, self.lin_tags(x), d)
+            chart_difference(x.tags, self.lin_tags(x), d)
             for column, row in zip(self.tag_column, d, strict=True):
                 if column >= 0:
                     out[column : column + 6] = row
@@ -236,7 +247,7 @@ class Problem:
             frames, tags = self.lin_frames(x), self.lin_tags(x)
             mounts = self.lin.mounts if self.frozen_mounts else x.mounts
         offset = float(x.offset_s[0])
-        out.cost, out.comparable = kernels.visual_terms(
+        out.cost, out.comparable = visual_terms(
             x.frames, frames, self.motion, self.models, self.params, x.mounts, mounts, offset, self.base,
             x.landmarks, s.start, s.frame, s.camera, s.before, s.px, s.sigma_px, s.inv_depth, s.sigma_inv_depth,
             s.shift_s, self.active, robust, out.chi2 if before is None else before, self.usual_inv_depth,
@@ -244,12 +255,12 @@ class Problem:
             out.H, out.g, out.V, out.g_landmark, out.W, out.chi2,
         )  # fmt: skip
         delta = self.offsets(x)[self.prior_at]
-        rest, out.imu_chi2 = kernels.state_terms(
+        rest, out.imu_chi2 = state_terms(
             x.frames, frames, self.measured, self.whiten, self.use_imu, self.still_sigma, self.still_sigma_m,
             self.prior_at, self.prior.H, self.prior.g, delta, self.pose_at, normal, out.H, out.g,
         )  # fmt: skip
         if len(t.frame):
-            rest += kernels.tag_terms(
+            rest += tag_terms(
                 x.frames, frames, self.motion, self.models, self.params, x.mounts, mounts, offset,
                 x.tags, tags, self.tag_column, self.corners_tag, t.tag, t.frame, t.camera, t.corners_px, t.sigma_px,
                 t.shift_s, t.use, self.pose_at, self.mount_at, self.offset_at, out.H, out.g, out.tag_chi2,
@@ -276,7 +287,7 @@ class Problem:
             else x.tags[self._row["tag", number]]
         )  # fmt: skip
         d = np.empty((1, len(row) - 6))
-        kernels.chart_difference(row[None], mean[None], d)
+        chart_difference(row[None], mean[None], d)
         return d.ravel()
 
     def minimize(self, iterations: int, converged_chi2: float = SETTLED_CHI2) -> int:
@@ -311,7 +322,7 @@ class Problem:
 
     def _step(self, damping: float, to: Unknowns) -> float:
         x, at, s = self.state, self.linear, self.sightings
-        gain = kernels.step(
+        gain = step(
             damping, x.frames, x.mounts, x.offset_s, x.tags, self.tag_column, x.landmarks, s.start, s.frame,
             self.pose_at, self.mount_at, self.offset_at, self.extra, at.H, at.g, at.V, at.g_landmark, at.W,
             self.V_inverse, self.S, to.frames, to.mounts, to.offset_s, to.tags, to.landmarks,
@@ -323,7 +334,7 @@ class Problem:
         """Marginal covariance of these columns at the state, None where the equations are not definite."""
         if not self._factored and self._step(0.0, self.state.empty()) < 0.0:
             return None
-        out = kernels.marginal_covariance(self.S, np.ascontiguousarray(columns, np.int32))
+        out = marginal_covariance(self.S, np.ascontiguousarray(columns, np.int32))
         symmetric: Array = 0.5 * (out + out.T)
         return symmetric
 
@@ -332,7 +343,7 @@ class Problem:
         at, s = self.linear, self.sightings
         H, b = at.H.copy(), at.g.copy()
         H[np.arange(self.n), np.arange(self.n)] -= NO_COVARIANCE
-        kernels.eliminate_landmarks(
+        eliminate_landmarks(
             0.0, s.start, s.frame, self.pose_at, self.extra, len(self.start.frames), at.V, at.g_landmark, at.W,
             self.V_inverse, H, b,
         )  # fmt: skip
