@@ -11,12 +11,17 @@ from conftest import shared_data
 from light_scenes import SPEC, along
 from lodelight.anchors import Anchors, Light
 from lodelight.evaluation.compare import compare
+from lodelight.features.features import Features
+from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.io.sources import open_source
 from lodelight.mapping.compact import compacted
+from lodelight.mapping.local import LocalMapper, LocalMappingConfig
+from lodelight.mapping.map import Map
 from lodelight.messages import Estimate
 from lodelight.settings import with_settings
 from lodelight.slam import Slam, SlamConfig
+from maps import room_rig
 
 END_S = 4.5
 
@@ -69,6 +74,28 @@ def test_in_its_own_map_it_is_found_again_and_stays_there_without_writing(flown)
     assert len(known.points) == before[1]
     for was, table in zip(before[0], (known.keyframes, known.loops), strict=True):
         assert np.array_equal(was, table.columns["R"])
+
+
+@pytest.mark.parametrize(("with_imu", "newer", "left"), [(True, 6, False), (True, 5, True), (False, 6, True)])
+def test_an_old_keyframe_does_not_stay_for_points_that_hardly_another_sees(with_imu, newer, left):
+    """20 of its points are seen by all, 10 by one more keyframe at most."""
+    map = Map(room_rig())
+    n = 30
+    px = np.column_stack([np.linspace(20.0, 600.0, n), np.full(n, 200.0)]).astype(np.float32)
+    zero = np.zeros(n, np.float32)
+    ray, _ = map.rig.cameras[0].camera.unproject(px)
+    seen = Features(px, np.zeros(n, np.int32), zero, np.zeros((n, 4), np.uint64), ray, zero, zero)
+    for k in range(newer + 2):
+        map.add_keyframe(k, SE3.identity(), seen, parent=k - 1)
+    rows = [np.arange(k * n, (k + 1) * n, dtype=np.int32) for k in range(newer + 2)]
+    points = map.add_points(np.tile([0.0, 0.0, 3.0], (n, 1)), rows[1], 1)
+    map.link(rows[2][20:25], points[20:25])
+    for k in (0, *range(2, newer + 2)):
+        map.link(rows[k][:20], points[:20])
+    mapper = LocalMapper(map, OrbConfig(), LocalMappingConfig(window=5))
+    mapper.hold_poses = with_imu
+    mapper._cull_keyframes(newer + 1)
+    assert map.keyframes.alive[1] == left
 
 
 def upright(up):

@@ -196,12 +196,17 @@ def rows_of_points(points: Ints, head: Ints, next_row: Ints, n_obs: Ints) -> Int
 
 
 @kernel
-def redundant_share(start: int, stop: int, point: Ints, next_row: Ints, octave: Ints, head: Ints, n_obs: Ints) -> float:
-    """Share of a keyframe's points that at least three other keyframes see at the same or a finer scale."""
+def redundant_share(
+    start: int, stop: int, point: Ints, next_row: Ints, octave: Ints, head: Ints, n_obs: Ints, least: int
+) -> float:
+    """Share of a keyframe's points that at least three other keyframes see at the same or a finer scale.
+
+    least : only points count that so many keyframes see
+    """
     total = redundant = 0
     for row in range(start, stop):
         m = point[row]
-        if m < 0:
+        if m < 0 or n_obs[m] < least:
             continue
         total += 1
         if n_obs[m] <= 3:

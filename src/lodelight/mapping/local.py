@@ -29,6 +29,11 @@ from lodelight.mapping.sight import in_sight, points_of_keyframes
 from lodelight.mapping.tag_corners import with_tag_corners
 from lodelight.types import AnyArray, Array, Bools, Ints
 
+# Keyframes that see a point, below which it is not worth its keyframe once that is old. With an IMU keyframes come by
+# the way that was flown, whatever is known; in known space each finds corners that were missed before, and with those
+# it would stay for ever.
+CONFIRMED = 3
+
 
 @dataclass(frozen=True)
 class LocalMappingConfig:
@@ -203,9 +208,10 @@ class LocalMapper:
             if int(other) in protected or kf.parent[other] < 0:
                 continue
             rows = map.feature_range(int(other))
+            settled = self.hold_poses and keyframe - other > self.config.window
             share = kernels.redundant_share(
                 rows.start, rows.stop, map.features.point, map.features.next, map.features.octave,
-                map.points.head, map.points.n_obs,
+                map.points.head, map.points.n_obs, CONFIRMED if settled else 1,
             )  # fmt: skip
             if share > self.config.redundant:
                 map.remove_keyframe(int(other))
