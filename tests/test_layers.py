@@ -22,7 +22,7 @@ LAYERS = [
     ["messages"],
     ["geometry"],
     ["fiducials"],
-    ["compiled", "types", "errors", "data"],
+    ["compiled", "memory", "types", "errors", "data"],
     ["freshness"],
 ]
 # Below the estimators in the list, yet not for them: they may not import these.

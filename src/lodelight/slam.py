@@ -36,6 +36,7 @@ from lodelight.mapping.path import Path, PathNode, laid_down
 from lodelight.mapping.places import Places
 from lodelight.mapping.tags import MapTags, MapTagsConfig
 from lodelight.mapping.worker import InlineMapping, ThreadedMapping
+from lodelight.memory import give_back_large
 from lodelight.messages import LOST_COVARIANCE, Estimate, Frame, LightFix, Message, TagSighting
 from lodelight.odometry.inertial import InertialOdometry, OdometryConfig
 from lodelight.rig import Rig
@@ -107,6 +108,7 @@ class Slam:
         live: bool = False,
         anchors: Anchors | None = None,
     ) -> None:
+        give_back_large()
         self.config = config or SlamConfig()
         visual, _, inertial = self.config.sensors.partition("-")
         self.front_end = FrontEnd(rig, visual, self.config.orb)
