@@ -1,8 +1,9 @@
-"""What the inertial system's noise rests on, and its memory: `python benchmarks/inertial.py imu|starts|tracks|memory
-FOLDER`.
+"""What the inertial system rests on: `python benchmarks/inertial.py imu|starts|consistency|tracks|memory FOLDER`.
 
 imu FOLDER : an EuRoC recording with groundtruth/*.csv; its IMU against its truth, as a density by averaging time
 starts FOLDER : of the same; starts in flight along it, with its IMU and simulated tracks: how many are wrong
+consistency FOLDER : of any recording with truth; starts along it, one camera, with its images or, `--simulated`, with
+    tracks along its truth: error and NEES of the velocity in the body's frame and of the tilt, and how fast it seems
 tracks FOLDER : a rendered recording (`lodelight sim`); how far tracks leave their points, by frames in between
 memory FOLDER : a recording that ends where and as it began, flown lap after lap for 30 minutes
 """
@@ -27,13 +28,15 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from lodelight.features.klt import KltTracker
+from lodelight.geometry.se3 import SE3
+from lodelight.geometry.so3 import skew
 from lodelight.imu.preintegration import preintegrate
 from lodelight.imu.samples import ImuSamples
 from lodelight.io.listing import ImuTable
 from lodelight.io.sources import open_source
 from lodelight.io.trajectories import read_trajectory
 from lodelight.messages import Frame, Imu
-from lodelight.odometry.inertial import InertialOdometry
+from lodelight.odometry.inertial import InertialOdometry, OdometryStep
 from lodelight.report.metrics import peak_rss_mb
 from lodelight.report.outputs import Outputs
 from lodelight.rig import ImuSpec
@@ -96,6 +99,61 @@ def starts(folder: Path, every_s: float = 4.1) -> None:
                 wrong += off > 0.1
                 break
     print(f"{len(took)} starts, {wrong} with a velocity off by more than 0.1 m/s; within {max(took):.2f} s")
+
+
+def consistency(folder: Path, simulated: bool = False, every_s: float = 0.5, run_s: float = 4.3) -> None:
+    recording = open_source(folder)
+    truth = recording.ground_truth()
+    assert truth is not None
+    motion, messages = Motion.fit(truth), list(recording.messages("mono-inertial"))
+    stamps = [m.t_ns for m in messages if isinstance(m, Frame)]
+    if simulated:  # in a room around the way
+        flown = motion.at_ns(np.array(stamps)).xyz
+        half = 0.5 * (flown.max(axis=0) - flown.min(axis=0))
+        there = motion.moved(SE3(np.eye(3), [0.0, 0.0, 2.5] - 0.5 * (flown.max(axis=0) + flown.min(axis=0))))
+    found: dict[int, list[list[float]]] = defaultdict(list)
+    for begin in np.arange(0.0, (stamps[-1] - stamps[0]) * 1e-9 - run_s, every_s):
+        t0, started = stamps[0] + int(begin * 1e9), -1
+        odometry = InertialOdometry(recording.rig, "mono")
+        if simulated:
+            room = (half[0] + 4.0, half[1] + 4.0, half[2] + 5.0)
+            odometry.tracker = Points(there, odometry.rig, 0, 0.07, room=room)  # type: ignore[assignment]
+        for message in messages:
+            if not t0 - 20_000_000 <= message.t_ns <= t0 + run_s * 1e9:
+                continue
+            if isinstance(message, Imu):
+                step = odometry.feed_imu(message)
+            elif isinstance(message, Frame) and message.t_ns >= t0:
+                step = odometry.feed_frame(Frame(message.t_ns, ()) if simulated else message)
+            if step is None or step.status != "tracking":
+                continue
+            started = step.frame.t_ns if started < 0 else started
+            seconds = (step.frame.t_ns - started) * 1e-9
+            if abs(seconds - round(seconds)) < 0.4 * STEP_S:
+                found[round(seconds)].append(_off(step, motion))
+    for seconds, rows in sorted(found.items()):
+        off = np.array(rows)
+        print(
+            f"{seconds} s after {len(off)} starts: velocity off by {np.sqrt((off[:, 0] ** 2).mean()):.3f} m/s, NEES "
+            f"{off[:, 1].mean():.2f}, {100.0 * off[:, 2].sum() / off[:, 3].sum():+.1f} % too fast; tilt off by "
+            f"{np.degrees(np.sqrt((off[:, 4] ** 2).mean())):.2f} deg, NEES {off[:, 5].mean():.2f}"
+        )
+
+
+def _off(step: OdometryStep, motion: Motion) -> list[float]:
+    """Error and NEES of the velocity in the body's frame, by how much it is too fast times its square, its square;
+    error and NEES of the tilt."""
+    true = motion.at_ns(np.array([step.frame.t_ns]))
+    R, R_true = step.state.T_world_body.R, true.R_world_body[0]
+    v, v_true = R.T @ step.state.v_world, R_true.T @ true.v_world[0]
+    J = np.zeros((3, 15))
+    J[:, :3], J[:, 6:9] = skew(v), R.T
+    off, P = v - v_true, J @ step.covariance @ J.T
+    across = np.linalg.svd(R[2][None])[2][1:]
+    tilt = across @ np.cross(R[2], R_true[2])
+    Q = across @ step.covariance[:3, :3] @ across.T
+    nees = off @ np.linalg.solve(P, off) / 3.0, tilt @ np.linalg.solve(Q, tilt) / 2.0
+    return [float(np.linalg.norm(off)), nees[0], off @ v_true, v_true @ v_true, float(np.linalg.norm(tilt)), nees[1]]
 
 
 def tracks(folder: Path, start_s: float = 12.0, end_s: float = 24.0) -> None:
@@ -162,7 +220,11 @@ def _resident_mb() -> float:
 
 if __name__ == "__main__":
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("what", choices=("imu", "starts", "tracks", "memory"))
+    arguments.add_argument("what", choices=("imu", "starts", "consistency", "tracks", "memory"))
     arguments.add_argument("folder", type=Path)
+    arguments.add_argument("--simulated", action="store_true")
     options = arguments.parse_args()
+    if options.what == "consistency":
+        consistency(options.folder, options.simulated)
+        sys.exit()
     {"imu": imu, "starts": starts, "tracks": tracks, "memory": memory}[options.what](options.folder)
