@@ -62,9 +62,16 @@ def test_carried_frames_need_points_of_either_kind_and_end_when_the_map_is_enoug
     assert states.state is State.following
 
 
-def test_soon_after_being_found_more_points_are_asked_of_a_carried_frame():
-    assert judged(followed(), [(60, 60), (60, 60), (10, 49)], start_s=0.1)[-1] is Step.unsure
-    assert judged(followed(), [(60, 60), (60, 60), (10, 50)], start_s=0.1)[-1] is Step.keep
+def test_soon_after_being_found_more_points_are_asked_of_a_carried_frame_until_the_map_has_held_it():
+    def last(found_by, *counts):
+        states = States(StatesConfig())
+        states.found(0, found_by)
+        return judged(states, counts, start_s=0.1)[-1]
+
+    assert last(60, (60, 60), (60, 60), (10, 49)) is Step.unsure
+    assert last(60, (60, 60), (60, 60), (10, 50)) is Step.keep
+    assert last(90, (60, 60), (60, 60), (10, 49)) is Step.keep
+    assert last(60, (90, 90), (60, 60), (60, 60), (10, 49)) is Step.keep
 
 
 def test_drift_is_borne_with_for_so_long_and_no_longer():

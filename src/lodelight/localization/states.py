@@ -43,7 +43,7 @@ class StatesConfig:
     min_inliers (N2) : below, it does not, and without temporary points the camera is lost
     patience : frames in a row that it takes to leave `following`, or to be lost
     carried_inliers : points of both kinds with which a carried frame has a pose
-    after_found_inliers : the same within after_found_s of having been found, when the motion is not known yet
+    after_found_inliers : the same within after_found_s of having been found, until the map has held the pose
     max_carried_s, max_carried_m : how long drift is borne with
     max_guessed_m : the same, where all that is seen has no distance
     """
@@ -72,14 +72,15 @@ class States:
         self.carried_m = 0.0  # since the map last held the pose, if only just
         self.guessed_m = 0.0  # of it, without enough points whose distance is known
         self._reckoned = False
-        self._found_ns = 0
+        self._doubted_ns: int | None = None  # when the camera was found, unless the map has held it since
         self._held_ns = 0  # when the map last held the pose, if only just
 
     def found(self, t_ns: int, in_map: int) -> None:
         """The camera was found; in_map : points of the map that agree with its pose."""
         self.state, self.why = State.following, ""
-        self.poor, self.weak = int(in_map < self.config.good_inliers), 0
-        self._found_ns = t_ns
+        held = in_map >= self.config.good_inliers
+        self.poor, self.weak = int(not held), 0
+        self._doubted_ns = None if held else t_ns
 
     def judge(
         self, t_ns: int, in_map: int, in_all: int, moved_m: float, guessed: bool = False, reckoned: bool = False
@@ -91,6 +92,8 @@ class States:
         reckoned : an IMU says well where the camera is, so that frames may fail in any number
         """
         self._reckoned = reckoned
+        if in_map >= self.config.good_inliers:
+            self._doubted_ns = None
         if self.state is State.carried:
             return self._carried(t_ns, in_map, in_all, moved_m, guessed)
         c = self.config
@@ -120,7 +123,7 @@ class States:
         if in_map >= c.good_inliers:
             self.leave("")
             return Step.leave
-        early = (t_ns - self._found_ns) * 1e-9 < c.after_found_s
+        early = self._doubted_ns is not None and (t_ns - self._doubted_ns) * 1e-9 < c.after_found_s
         needed = c.after_found_inliers if early else c.carried_inliers
         if in_all < needed:
             return self._unsure(f"{in_all} points agree, temporary ones counted in, {needed} are needed")
