@@ -99,6 +99,12 @@ def test_an_imu_of_another_unit_or_sign_is_named(change, named):
         run(motion, 1, change=lambda m: change(m) if isinstance(m, Imu) else m)
 
 
+def test_a_turned_accelerometer_is_named_after_a_start_at_rest_once_one_camera_moves():
+    motion = flight(4.5, seed=2, rest_s=1.0)
+    with pytest.raises(SourceError, match="sign is turned"):
+        run(motion, 1, change=lambda m: dataclasses.replace(m, accel=-m.accel) if isinstance(m, Imu) else m)
+
+
 def test_a_push_before_the_start_is_not_taken_for_a_bias():
     """1 m/s^2 that is no motion over the first 0.6 s, as of a drone that leaves the ground: later images are used."""
     motion = flight(3.0, seed=0)

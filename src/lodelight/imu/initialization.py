@@ -29,6 +29,7 @@ from lodelight.types import AnyArray, Array
 GRAVITY_M_S2 = 9.81
 ALIGNED_VIEWS = 12
 SIGN_CHI2 = 16.0  # by so much must the accelerometer's turned sign fit better
+SIGN_SCALE = 0.25  # deviation of a scale of which it is known that it is not negative
 BIAS_CHI2 = 16.27  # 99.9 % of three degrees of freedom
 
 
@@ -125,6 +126,7 @@ class Starter:
         self.focal_px = focal_px
         self.metric = metric
         self.doubted = False  # images and IMU were found to contradict each other
+        self.turns_fit = False  # a window has turned, and images and gyroscope agreed
         self._odd_ns: int | None = None  # the last image when a start first believed in a bias that is not likely
         self.views: list[StartView] = []
         self.imu: list[ImuSamples] = []  # imu[i] from views[i] to views[i + 1]
@@ -182,10 +184,11 @@ class Starter:
         return in_motion if isinstance(in_motion, Started) else f"{at_rest}; {in_motion}"
 
     def in_motion(self) -> Started | str:
-        """The start in motion or what is missing, for one who has started already."""
+        """The start in motion or what is missing, for one who has started already. Raises SourceError where the
+        accelerometer's sign is turned."""
         if self._span_s < self._without_tags_s:
             return "too short"
-        return self._in_motion(False)
+        return self._in_motion(True)
 
     @property
     def _without_tags_s(self) -> float:
@@ -336,6 +339,8 @@ class Starter:
         return bias
 
     def _gyro_fault(self) -> str:
+        if self.turns_fit:
+            return ""
         R = self.T_body_cam[0].R
         seen = np.stack([so3_log(np.ascontiguousarray(R @ v.R_now_last.T @ R.T)) for v in self.views[1:]])
         dt_s = [(s.t_ns[-1] - s.t_ns[0]) * 1e-9 for s in self.imu]
@@ -355,7 +360,7 @@ class Starter:
                 best = max(best, float(np.median(np.linalg.norm(np.cross(ray_a[a], turned), axis=1))))
         return math.degrees(best)
 
-    def _missing(self, found: Alignment, motions: list[Preintegration]) -> str:
+    def _misfit(self, found: Alignment) -> str:
         c = self.config
         if found.inliers < 0.6 * found.n:
             return f"{found.inliers} of {found.n} sightings agree with the IMU; check the camera's pose and the clocks"
@@ -365,6 +370,13 @@ class Starter:
                 f"images and IMU differ by {left_px:.2f} px, {c.max_px:.2f} at most; check the camera's pose and the "
                 "clocks"
             )
+        return ""
+
+    def _missing(self, found: Alignment, motions: list[Preintegration]) -> str:
+        c = self.config
+        misfit = self._misfit(found)
+        if misfit:
+            return misfit
         shares = [
             (
                 0.0 if self.metric or self._tags else self._sigma_scale(found, motions),
@@ -384,7 +396,10 @@ class Starter:
         motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
         self.imu = imu
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray)
-        if not isinstance(found, Alignment) or found.behind > 0.2 or self._missing(found, motions):
+        if not isinstance(found, Alignment) or found.behind > 0.2:
+            return
+        unknown = not self.metric and self._sigma_scale(found, motions) > SIGN_SCALE
+        if self._misfit(found) or unknown or (self.metric and self._missing(found, motions)):
             return
         if isinstance(as_it_is, str) or found.chi2 + SIGN_CHI2 < as_it_is.chi2:
             raise SourceError(

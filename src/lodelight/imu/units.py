@@ -35,7 +35,8 @@ def gyroscope_fault(turned: Array, seen: Array, duration_s: float) -> str:
     excess = max(by_gyro - 0.3 * duration_s, 0.0)
     if np.degrees(max(excess, by_images)) < MIN_TURN_DEG:
         return ""
-    in_deg = np.linalg.norm(turned / DEG_PER_RAD - seen, axis=1).sum()
+    differ = turned / DEG_PER_RAD - seen
+    in_deg = np.linalg.norm(differ - differ.mean(axis=0), axis=1).sum()  # its bias is in deg/s as well
     if excess > 10.0 * max(by_images, 0.02) and in_deg < 0.7 * by_images + 0.01 * duration_s:
         return (
             f"the gyroscope turned by {by_gyro:.1f} rad while the images turned by {by_images:.3f}: it is in deg/s; "

@@ -33,6 +33,7 @@ from lodelight.types import Array
 
 EventSink = Callable[..., None]
 CONTRADICTION = "images and IMU contradict each other"
+TURNED_DEG = 10.0  # within a window, that shows that the gyroscope's unit and axes are right
 UNKNOWN_15 = np.diag(np.repeat([math.pi**2, 1e6, 1e4, 1.0, 10.0], 3))
 
 
@@ -186,7 +187,9 @@ class InertialOdometry:
         self._judge_tags(tags, solution)
         state = window.newest
         inliers = len(tracks) - len(solution.outliers)
-        failure = self._failure(solution, state) or self._wrong_scale(tracks, imu, state.T_world_body)
+        failure = self._failure(solution, state)
+        self.starter.doubted |= bool(failure)
+        failure = failure or self._wrong_scale(tracks, imu, state.T_world_body)
         blind = "" if failure else self._blind(inliers, frame.t_ns)
         if failure or blind:
             return self._fail(frame, failure or blind, reliable=not failure)
@@ -196,6 +199,8 @@ class InertialOdometry:
         few = self._blind_since is not None
         why = f"{inliers} tracks agree, fewer than {self.config.few_tracks}: the IMU carries the pose" if few else ""
         self._believed = state, self._covariance(window)
+        oldest = window.keyframes()[0].T_world_body
+        self.starter.turns_fit |= (oldest.inverse() @ state.T_world_body).exceeds(np.inf, TURNED_DEG)
         self.stream.forget_before(frame.t_ns)
         return OdometryStep(
             frame, "degraded" if few else "tracking", *self._believed, tracks, inliers, reason, why,
@@ -346,7 +351,7 @@ class InertialOdometry:
         self._probation.tried.clear()
         for name in placed:
             self._probation.admit(name, window.newest.t_ns)
-        self._check = self._scale_check(placed)
+        self._check = self._scale_check(placed) if placed or still else None
         self.starter.reset()
         self._views = []
         return window
@@ -363,7 +368,7 @@ class InertialOdometry:
         return placed if placed or not start.tags else f"it is not clear how {start.tags[0]} hangs"
 
     def _scale_check(self, placed: Mapping[str, SE3]) -> ScaleCheck | None:
-        if self.starter.metric or not placed:
+        if self.starter.metric:
             return None
         assert self.window is not None
         sizes = {s.name: s.size_m for _, tags in self._views for s in tags if s.name in placed and s.size_m}
@@ -372,7 +377,8 @@ class InertialOdometry:
     def _wrong_scale(self, tracks: Tracks, imu: ImuSamples, T_map_body: SE3) -> str:
         """How large the tags are by which a window of one camera began, if not as they say."""
         check = self._check
-        found = None if check is None else check.add(self._view(tracks), imu, T_map_body)
+        still = self._still(imu)
+        found = None if check is None else check.add(self._view(tracks), imu, T_map_body, still)
         if check is None or (found is None and not check.over(tracks.t_ns)):
             return ""
         self._check = None
@@ -431,7 +437,6 @@ class InertialOdometry:
         self._tag_start.refused |= set() if self._check is None else set(self._check.sizes)  # it may be their fault
         self.window, self._keyframe, self._blind_since, self._check = None, None, None, None
         self.restarts += 1
-        self.starter.doubted |= CONTRADICTION in why
         self.starter.reset()
         self._views = []
         self.tracker.reset()

@@ -111,9 +111,10 @@ class TagStart:
 
 @dataclass(eq=False)
 class ScaleCheck:
-    """Whether a window of one camera that began by tags is as large as images and IMU say without them.
+    """Whether a window of one camera that began by tags is as large as images and IMU say without them; and, as of one
+    that began at rest, whether the accelerometer's sign is turned, of which both know nothing before they move.
 
-    starter : one that has no images yet; sizes : m, of those tags by name
+    starter : one that has no images yet; sizes : m, of those tags by name; started_ns : or rested last
     """
 
     starter: Starter
@@ -122,8 +123,12 @@ class ScaleCheck:
     _at: dict[int, Array] = field(default_factory=dict)
     _tried_ns: int = 0
 
-    def add(self, view: StartView, imu: ImuSamples, T_map_body: SE3) -> dict[str, MeasuredSize] | None:
-        """The next image, without rows of tags; how large the tags are, as soon as that is known."""
+    def add(
+        self, view: StartView, imu: ImuSamples, T_map_body: SE3, still: bool = False
+    ) -> dict[str, MeasuredSize] | None:
+        """The next image, without rows of tags; how large the tags are, as soon as that is known. Raises SourceError
+        where the accelerometer's sign is turned."""
+        self.started_ns = view.t_ns if still else self.started_ns
         self.starter.add(view, imu if self._at else None)
         self._at[view.t_ns] = T_map_body.t
         if (view.t_ns - max(self._tried_ns, self.started_ns)) * 1e-9 < CHECK_EVERY_S:
