@@ -73,6 +73,15 @@ def test_one_camera_starts_in_flight_and_stays_within_centimetres():
     assert "needed" in before[3].why
 
 
+def test_an_imu_that_is_said_to_have_no_noise_is_believed_only_almost():
+    spec = ImuSpec(gyro_noise=0.0, gyro_walk=0.0, accel_noise=0.0, accel_walk=0.0)
+    steps, odometry, _ = run(flight(2.5, seed=0), 2, spec=spec)
+    assert odometry.restarts == 0
+    assert steps[-1].status == "tracking"
+    assert judged(steps, flight(2.5, seed=0)).ate.rmse_m < 0.03
+    assert np.isfinite(steps[-1].covariance).all()
+
+
 def test_standing_still_starts_within_half_a_second():
     motion = flight(2.0, seed=1, rest_s=1.0)
     steps, _, events = run(motion, 1, sigma_px=0.03)

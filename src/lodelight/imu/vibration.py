@@ -18,15 +18,18 @@ from lodelight.rig import ImuSpec
 from lodelight.types import Array
 
 MEMORY_S = 1.0
+# A tenth of the noise of a good MEMS sensor. One that is said to have none, as a simulated one may be, could not be
+# weighed against anything.
+LEAST = {"gyro_noise": 1.7e-5, "gyro_walk": 1.9e-6, "accel_noise": 2.0e-4, "accel_walk": 3.0e-4}
 
 
 class Vibration:
-    """Follows the noise of an IMU. share : of white noise as strong as what the samples show."""
+    """Follows the noise of an IMU. spec : of one at rest; share : of white noise as strong as what the samples show."""
 
     def __init__(self, spec: ImuSpec, share: float) -> None:
-        self.spec = spec
+        self.spec = replace(spec, **{name: max(least, getattr(spec, name)) for name, least in LEAST.items()})
         self.share = share
-        self._density2 = np.array([spec.gyro_noise, spec.accel_noise]) ** 2
+        self._density2 = np.array([self.spec.gyro_noise, self.spec.accel_noise]) ** 2
 
     def add(self, samples: ImuSamples) -> ImuSpec:
         """The specification with the noise that the samples so far show, never less than the data sheet's."""

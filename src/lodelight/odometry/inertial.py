@@ -97,15 +97,15 @@ class InertialOdometry:
         self.config = config or OdometryConfig()
         assert rig.imu is not None
         self.rig = rig.with_cameras(2 if sensors == "stereo" else 1)
-        self.spec = rig.imu
         self.emit: EventSink = on_event or (lambda t_ns, kind, **fields: None)
         self.tracker = KltTracker(rig, sensors, self.config.klt, seed)
         self.stream = ImuStream(rig.imu, self.emit)
         self.vibration = Vibration(rig.imu, self.config.vibration)
+        self.spec = self.vibration.spec
         self.camera = rig.cameras[0].camera
         self.R_body_cam = rig.cameras[0].T_body_cam.R
         self.starter = Starter(
-            rig.imu, [c.T_body_cam for c in self.rig.cameras], self.camera.focal_px, sensors != "mono",
+            self.spec, [c.T_body_cam for c in self.rig.cameras], self.camera.focal_px, sensors != "mono",
             self.config.start,
         )  # fmt: skip
         self.window: Window | None = None
