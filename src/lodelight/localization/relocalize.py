@@ -84,7 +84,9 @@ class Relocalizer:
         self.config = config or RelocalizerConfig()
         self.places = places or Places(map)
         self.T_body_cam = (spec or map.rig.cameras[0]).T_body_cam
-        self._verifier = Verifier(map, orb, self.config.sigma_px, spec, True, self.config.min_agreeing)
+        self._verifier = Verifier(
+            map, orb, self.config.sigma_px, spec, whole_place=True, min_agreeing=self.config.min_agreeing
+        )
 
     def find(self, seen: Features, hint: Hint | None = None) -> Found | str:
         """Pose of a frame in the map and what it shows of it, or why none is believed.
