@@ -387,3 +387,13 @@ def test_a_pair_of_frames_makes_points_where_they_are_of_patches_as_large_as_the
     xyz = overlay.table.xyz[frames[1].temporary[made]]
     away_m = np.linalg.norm(corridor.xyz[which[made]] - poses[1].t, axis=1)
     assert np.median(np.linalg.norm(xyz - corridor.xyz[which[made]], axis=1) / away_m) < 0.05
+
+
+def test_a_long_way_without_the_map_does_not_run_out_of_points():
+    """Those left behind make room for new ones."""
+    few = LadderConfig(temporary=TemporaryConfig(most=300))
+    walked = Walk(gap=(6.0, 20.0), x_m=(2.0, 14.0), config=few)
+    assert walked.localized.all()
+    assert walked.error_m.max() < 0.1
+    assert walked.ladder.temporary.created > 600
+    assert len(walked.ladder.temporary) <= 300

@@ -40,6 +40,7 @@ class Growth:
         """
         if tracked.temporary is None:
             tracked.temporary = np.full(len(tracked.seen), -1, np.int32)
+        self.points.make_room(tracked.temporary)
         points, before = self.points, self.points.created
         self._from_depth(tracked)
         self._measure(points.past if tracked.guessed else [*points.past, points.past_of(tracked, False)])

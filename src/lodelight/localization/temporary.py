@@ -130,6 +130,15 @@ class TemporaryPoints:
         bad = (t.n_visible >= 2) & (t.n_found < np.maximum(self.config.found_ratio * t.n_visible, 1.0))
         t.alive[bad] = False
 
+    def make_room(self, temporary: Ints) -> None:
+        """Where there are nearly as many points as may be, the oldest go that neither an earlier frame names nor
+        `temporary` (N,): the camera has left them behind."""
+        surplus = len(self) + self.config.enough - self.config.most
+        if surplus > 0:
+            named = np.concatenate([temporary, *(past.temporary for past in self._past)])
+            left_behind = np.setdiff1d(np.flatnonzero(self.table.alive), named)
+            self.table.alive[left_behind[:surplus]] = False
+
     def alive(self, temporary: Ints) -> Ints:
         """(N,) with the numbers of points that are gone set to -1."""
         out: Ints = (
