@@ -53,6 +53,7 @@ class MapTagsConfig:
 
 
 TELLING_VIEWS = 6  # of a tag that do not agree, before it is named: of three one may well be poor
+VISIT_NS = 10_000_000_000  # views further apart are of two visits
 
 
 class MapTags:
@@ -257,9 +258,17 @@ class MapTags:
             found = self._by_views(tag)
             if isinstance(found, MappedTag):
                 self._place(tag, found.T_world_tag, found.covariance)
-            elif "agree" in found.why and np.sum(self.map.tag_views.tag == tag) >= TELLING_VIEWS:
+            elif "agree" in found.why and self._disagree(tag):
                 self._tell(t_ns, tag_name(self.map, tag), "contradicts", found.why)
         self._fresh.clear()
+
+    def _disagree(self, tag: int) -> bool:
+        """Whether views of one visit do: between two visits the map may have to be bent."""
+        views = views_of(self.map, tag, self.config.max_views, False)
+        last_ns = max((v.sighting.t_ns for v in views), default=0)
+        views = [v for v in views if last_ns - v.sighting.t_ns < VISIT_NS]
+        found = map_tag(views, float(self.map.tags.size_m[tag]), self.spec.camera, self.config.survey)
+        return len(views) >= TELLING_VIEWS and isinstance(found, Unmapped) and "agree" in found.why
 
     def _by_views(self, tag: int, every: bool = False) -> MappedTag | Unmapped:
         views = views_of(self.map, tag, self.config.max_views, every)
