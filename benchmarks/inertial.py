@@ -1,11 +1,12 @@
-"""What the inertial system rests on: `python benchmarks/inertial.py imu|starts|consistency|tracks|memory FOLDER`.
+"""What the inertial system rests on: `python benchmarks/inertial.py imu|starts|consistency|tracks|loop|memory FOLDER`.
 
 imu FOLDER : an EuRoC recording with groundtruth/*.csv; its IMU against its truth, as a density by averaging time
 starts FOLDER : of the same; starts in flight along it, with its IMU and simulated tracks: how many are wrong
 consistency FOLDER : of any recording with truth; starts along it, one camera, with its images or, `--simulated`, with
     tracks along its truth: error and NEES of the velocity in the body's frame and of the tilt, and how fast it seems
 tracks FOLDER : a rendered recording (`lodelight sim`); how far tracks leave their points, by frames in between
-memory FOLDER : a recording that ends where and as it began, flown lap after lap for 30 minutes
+loop FOLDER : render a minute through the office, there and back, that ends where and as it began
+memory FOLDER : such a recording, flown again and again for 30 minutes
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from lodelight.imu.preintegration import preintegrate
 from lodelight.imu.samples import ImuSamples
 from lodelight.io.listing import ImuTable
 from lodelight.io.sources import open_source
-from lodelight.io.trajectories import read_trajectory
+from lodelight.io.trajectories import read_trajectory, write_tum
 from lodelight.messages import Frame, Imu
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
 from lodelight.report.metrics import peak_rss_mb
@@ -42,9 +43,10 @@ from lodelight.report.outputs import Outputs
 from lodelight.rig import ImuSpec
 from lodelight.sim import rigs
 from lodelight.sim.motion import GRAVITY, Motion
-from lodelight.sim.scenarios import Request, prepare
+from lodelight.sim.scenarios import Request, prepare, simulate
 from lodelight.sim.space import Space
 from lodelight.slam import Slam, SlamConfig
+from lodelight.trajectory import Trajectory
 from odometry_scenes import Points
 
 STEP_S = 0.05
@@ -179,6 +181,21 @@ def tracks(folder: Path, start_s: float = 12.0, end_s: float = 24.0) -> None:
         print(f"{gap} frames: {1.4826 * np.median(np.abs(change)):.3f} px an axis (1.48 times the median)")
 
 
+def loop(folder: Path, lap_s: float = 60.0, way_s: float = 28.0) -> None:
+    t = np.arange(0.0, lap_s + 1e-9, 0.02)
+    way = prepare(Request("office", seed=5, duration_s=way_s + 2.0, motion="drone"), 1, lit=False).motion
+    state = way.at(0.5 + 0.5 * way_s * (1.0 - np.cos(2.0 * np.pi * t / lap_s)))
+    there_and_back = Trajectory(
+        10**12 + np.round(t * 1e9).astype(np.int64), state.xyz, state.quat_wxyz[:, [1, 2, 3, 0]]
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        write_tum(Path(scratch) / "loop.tum", there_and_back)
+        simulate(
+            "office", folder, seed=5, trajectory=str(Path(scratch) / "loop.tum"), imu="perfect", size=(376, 240),
+            rate_hz=8.0, depth=False, lights=False,
+        )  # fmt: skip
+
+
 def memory(folder: Path, minutes: float = 30.0, every_min: float = 2.0) -> None:
     slam: Slam | None = None
     shift = frames = localized = 0
@@ -220,11 +237,11 @@ def _resident_mb() -> float:
 
 if __name__ == "__main__":
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("what", choices=("imu", "starts", "consistency", "tracks", "memory"))
+    arguments.add_argument("what", choices=("imu", "starts", "consistency", "tracks", "loop", "memory"))
     arguments.add_argument("folder", type=Path)
     arguments.add_argument("--simulated", action="store_true")
     options = arguments.parse_args()
     if options.what == "consistency":
         consistency(options.folder, options.simulated)
         sys.exit()
-    {"imu": imu, "starts": starts, "tracks": tracks, "memory": memory}[options.what](options.folder)
+    {"imu": imu, "starts": starts, "tracks": tracks, "loop": loop, "memory": memory}[options.what](options.folder)
