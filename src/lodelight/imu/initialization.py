@@ -247,7 +247,7 @@ class Starter:
         if lasting < c.min_tracks and len(rows.start) - 1 < 2 * c.min_tracks:
             return f"{lasting} tracks last for {self._span_s:.1f} s, {c.min_tracks} are needed"
         bias = self._gyro_bias()
-        motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
+        motions = self._motions(bias)
         parallax = math.inf if self.metric else self._parallax_deg(motions)
         if parallax < c.min_parallax_deg and not self._tags:
             return f"a parallax of {parallax:.2f} deg, {c.min_parallax_deg:.2f} are needed"
@@ -305,11 +305,11 @@ class Starter:
         return sorted({round(i) for i in np.linspace(0, last, min(ALIGNED_VIEWS, last + 1))})
 
     def _motions(self, bias: Array) -> list[Preintegration]:
-        """From the first image to every other."""
+        """From the first image to every other that was chosen."""
         out = [preintegrate(self.imu[0], bias, np.zeros(3), self.spec)]
         for samples in self.imu[1:]:
             out.append(out[-1].extended(samples))
-        return out
+        return [out[i - 1] for i in self._chosen[1:]]
 
     def _gyro_bias(self) -> Array:
         """From frame to frame first, then between frames farther apart, which tell it more sharply."""
@@ -393,7 +393,7 @@ class Starter:
         better than `as_it_is`."""
         imu = self.imu
         self.imu = [ImuSamples(s.t_ns, s.gyro, -s.accel) for s in imu]
-        motions = [self._motions(bias)[i - 1] for i in self._chosen[1:]]
+        motions = self._motions(bias)
         self.imu = imu
         found = align(Motions.of(motions), rows, self.T_body_cam, sigma_ray)
         if not isinstance(found, Alignment) or found.behind > 0.2:
