@@ -7,10 +7,12 @@ import subprocess
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lodelight.errors import SourceError
 from lodelight.geometry.se3 import SE3
 from lodelight.messages import Estimate
+from lodelight.report.folder import read_folder
 from lodelight.report.html import MAX_EVENTS_OF_A_KIND, write_report
 from lodelight.report.outputs import Outputs
 from lodelight.trajectory import Trajectory
@@ -117,6 +119,20 @@ def test_an_incomplete_folder_is_one_clear_error(tmp_path):
     (tmp_path / "frames.csv").unlink()
     with pytest.raises(SourceError, match=r"no complete out folder .*frames\.csv"):
         write_report(tmp_path, walk(30))
+
+
+def test_a_live_pose_counts_in_the_world_from_where_it_lies_there(tmp_path):
+    true, away = walk(30), SE3(np.eye(3), np.array([5.0, 0.0, 0.0]))
+    with Outputs(tmp_path, {}) as outputs:
+        for i, t_ns in enumerate(true.t_ns.tolist()):
+            T = SE3(Rotation.from_quat(true.quat_xyzw[i]).as_matrix(), true.xyz[i])
+            there = {"aligned": float(i >= 10)}
+            outputs.frame(Estimate(t_ns, "tracking", T if i >= 10 else away @ T, np.eye(6), details=there), 1.0, 0.0)
+        outputs.finish(true, np.zeros((1, 3)), {}, true, wall_s=1.0, compile_s=0.0, recording_s=1.0, align="none")
+    live = read_folder(tmp_path, true, "none").live
+    assert live.errors is not None
+    assert len(live.errors.t_ns) == 20
+    assert live.errors.position_m.max() < 1e-6
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])

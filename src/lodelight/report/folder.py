@@ -104,7 +104,10 @@ def read_folder(out: Path, truth: Trajectory | None, mode: Mode) -> RunFolder:
         raise SourceError(f"{out} is no complete out folder ({error}); run again") from None
     t_ns, covariances = read_covariances(out / "covariance.csv")
     variances = np.einsum("nii->ni", covariances)
-    live = _placed(_poses(out / "trajectory_live.tum"), truth, mode)
+    told = _poses(out / "trajectory_live.tum")
+    if mode == "none":  # before it lay in the world it was in another frame
+        told = told.rows(np.isin(told.t_ns, _stamps_of_aligned(frames)))
+    live = _placed(told, truth, mode)
     return RunFolder(
         name=out.resolve().name,
         metrics=metrics,
@@ -120,6 +123,13 @@ def read_folder(out: Path, truth: Trajectory | None, mode: Mode) -> RunFolder:
         sigma_m=np.sqrt(variances[:, 3:].sum(axis=1)),
         sigma_deg=np.rad2deg(np.sqrt(variances[:, :3].sum(axis=1))),
     )
+
+
+def _stamps_of_aligned(frames: dict[str, list[str]]) -> NDArray[np.int64]:
+    """Of the frames whose pose was one in the world; of all where that was not asked."""
+    aligned = frames.get("aligned", ["1"] * len(frames["t_ns"]))
+    stamps = [int(t) for t, cell in zip(frames["t_ns"], aligned, strict=True) if cell and float(cell)]
+    return np.array(stamps, np.int64)
 
 
 def _poses(path: Path) -> Trajectory:
