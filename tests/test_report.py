@@ -127,7 +127,8 @@ def test_a_live_pose_counts_in_the_world_from_where_it_lies_there(tmp_path):
         for i, t_ns in enumerate(true.t_ns.tolist()):
             T = SE3(Rotation.from_quat(true.quat_xyzw[i]).as_matrix(), true.xyz[i])
             there = {"aligned": float(i >= 10)}
-            outputs.frame(Estimate(t_ns, "tracking", T if i >= 10 else away @ T, np.eye(6), details=there), 1.0, 0.0)
+            told = Estimate(t_ns, "tracking", T if i >= 10 else away @ T, np.eye(6), details=there)
+            outputs.frame(told, 1.0, 0.0, **there)
         outputs.finish(true, np.zeros((1, 3)), {}, true, wall_s=1.0, compile_s=0.0, recording_s=1.0, align="none")
     live = read_folder(tmp_path, true, "none").live
     assert live.errors is not None
