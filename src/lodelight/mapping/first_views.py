@@ -39,6 +39,7 @@ FAR = 1e6  # baselines, up to which a point may vote for being ahead
 PROBABILITY = 0.9999  # that a draw of right matches only was among those tried
 HELD = 1e-3  # to what share of itself the length of the way between them is held
 ITERATIONS = 30
+LEAST_RIVAL = 8  # points with parallax that a motion needs to be one
 RIVAL_CHI2, APART_RAD = 25.0, math.radians(5.0)  # five standard deviations more misfit, and another motion is refuted
 
 
@@ -75,12 +76,14 @@ class FirstView:
 @dataclass(frozen=True, eq=False)
 class Begun:
     """Views and what they see. xyz (M, 3) : in the first body's frame, in m if `metric`, else of SUPPOSED_M from it in
-    the median; misfit : chi-square of all observations, those that do not fit at their bound"""
+    the median; misfit : chi-square of all observations, those that do not fit at their bound; lacks : what is missing
+    before a map may begin of it, which it may contest meanwhile"""
 
     views: list[FirstView]
     xyz: Array
     metric: bool
     misfit: float
+    lacks: str = ""
 
 
 class FirstViews:
@@ -161,7 +164,7 @@ class FirstViews:
         best = possible[0]
         if any(_differ(best, m) and m.misfit < best.misfit + RIVAL_CHI2 for m in possible[1:]):
             return "two motions fit what is seen; move on"
-        return best
+        return best.lacks or best
 
     def _motions(self, there: Features, here: Features) -> tuple[list[SE3], float]:
         """How the camera may have moved between two views of the same corners; translations are one long.
@@ -200,7 +203,7 @@ class FirstViews:
             return f"{n_agree} matches agree on a motion, {config.min_points} are needed to begin a map"
         found = self._points([(views[0], SE3.identity()), (views[-1], T_first_last)], corner[agree])
         good = self._good(found)
-        if np.count_nonzero(good) < config.min_points:
+        if np.count_nonzero(good) < LEAST_RIVAL:
             return self._too_few(int(np.count_nonzero(good)))
         poses = self._between(views, corner[agree][good], found.xyz[good], T_first_last)
         if poses is None:
@@ -241,8 +244,6 @@ class FirstViews:
         )  # fmt: skip
         result = bundle_adjust(problem, ITERATIONS, covariance_of=[len(views) - 1])
         doubt = _doubt_of_direction(result.p[-1] - result.p[0], result.covariance[0][3:, 3:])
-        if doubt > math.radians(self.config.max_direction_deg):
-            return f"the direction of motion is known to {math.degrees(doubt):.0f} deg only; move sideways"
         at = 0
         for k, there in enumerate(which):
             fits = result.inliers[at : at + len(there)]
@@ -255,9 +256,14 @@ class FirstViews:
         views = [replace(v, T_world_body=T, row=row) for v, T, row in zip(views, bodies, rows, strict=True)]
         found = self._points([(v, v.T_world_body @ T_body_cam) for v in views], np.arange(len(corner), dtype=np.int32))
         good = self._good(found) & (views[0].row >= 0)
-        if np.count_nonzero(good) < self.config.min_points:
-            return self._too_few(int(np.count_nonzero(good)))
         misfit = float(np.minimum(result.chi2, CHI2_PX).sum()) + CHI2_PX * (n_seen - n)
+        lacks = ""
+        if np.count_nonzero(good) < self.config.min_points:
+            lacks = self._too_few(int(np.count_nonzero(good)))
+        elif doubt > math.radians(self.config.max_direction_deg):
+            lacks = f"the direction of motion is known to {math.degrees(doubt):.0f} deg only; move sideways"
+        if lacks:
+            return Begun(views, found.xyz[good], False, misfit, lacks)
         scale = self._scale_by_tags(views)
         metric = scale is not None
         origin = T_body_cam.t
