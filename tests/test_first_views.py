@@ -11,7 +11,7 @@ from lodelight.features.features import Features
 from lodelight.features.orb import OrbConfig
 from lodelight.geometry.se3 import SE3
 from lodelight.io import open_source
-from lodelight.mapping.first_views import SUPPOSED_M, Begun, FirstViews, FirstViewsConfig
+from lodelight.mapping.first_views import SUPPOSED_M, Begun, FirstView, FirstViews, FirstViewsConfig
 from lodelight.messages import Frame, TagSighting
 from lodelight.slam import Slam, SlamConfig
 from maps import room_points, room_rig
@@ -93,6 +93,20 @@ def test_a_camera_that_moves_begins_a_map_of_the_right_shape(seed, way):
     way_here = (last.T_world_body @ spec.T_body_cam).t - spec.T_body_cam.t
     cosine = way_true @ way_here / np.linalg.norm(way_true) / np.linalg.norm(way_here)
     assert cosine > np.cos(np.radians(6.0))
+
+
+@pytest.mark.parametrize(("misfit", "waits"), [(400.0, True), (990.0, True), (1100.0, False)])
+def test_a_motion_that_lacks_parallax_yet_contests_one_that_fits_no_better(monkeypatch, misfit, waits):
+    scene = Scene(room(0), 0)
+    first = FirstViews(scene.rig.cameras[0], OrbConfig(), 1.0, FirstViewsConfig())
+    made = []
+    for way, fit, lacks in (((0.0, 1.0, 0.0), 1000.0, ""), ((1.0, 0.0, 0.0), misfit, "12 points have parallax enough")):
+        views = [FirstView(k, scene.view(at()), (), SE3(np.eye(3), k * np.array(way)), np.zeros(0, int)) for k in (0, 1)]
+        made.append(Begun(views, np.zeros((0, 3)), False, fit, lacks))
+    monkeypatch.setattr(first, "_motions", lambda there, here: ([SE3.identity()] * 2, 0.0))
+    monkeypatch.setattr(first, "_made_by", lambda *args: made.pop(0))
+    first.feed(0, scene.view(at()))
+    assert isinstance(first.feed(1, scene.view(at(y=2.1))), str) == waits
 
 
 @pytest.mark.parametrize("seed", range(5))
