@@ -101,7 +101,8 @@ def test_a_motion_that_lacks_parallax_yet_contests_one_that_fits_no_better(monke
     first = FirstViews(scene.rig.cameras[0], OrbConfig(), 1.0, FirstViewsConfig())
     made = []
     for way, fit, lacks in (((0.0, 1.0, 0.0), 1000.0, ""), ((1.0, 0.0, 0.0), misfit, "12 points have parallax enough")):
-        views = [FirstView(k, scene.view(at()), (), SE3(np.eye(3), k * np.array(way)), np.zeros(0, int)) for k in (0, 1)]
+        there = SE3.identity(), SE3(np.eye(3), np.array(way))
+        views = [FirstView(k, scene.view(at()), (), T, np.zeros(0, int)) for k, T in enumerate(there)]
         made.append(Begun(views, np.zeros((0, 3)), False, fit, lacks))
     monkeypatch.setattr(first, "_motions", lambda there, here: ([SE3.identity()] * 2, 0.0))
     monkeypatch.setattr(first, "_made_by", lambda *args: made.pop(0))
