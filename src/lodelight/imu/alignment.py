@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from lodelight.types import Array, Ints
 
 GRAVITY_M_S2 = 9.81
 LINEAR_REPETITIONS = 4
+SOME = 60  # landmarks that find the way to a solution
 MOST_BEHIND = 0.5  # share of the landmarks
 BEHIND = "most landmarks would lie behind the camera"
 # One camera in slow motion takes twenty steps and more from the linear answer, which takes a scene for smaller than it
@@ -56,6 +57,21 @@ class Rows:
         """(M + 1,) where each landmark's rows begin."""
         m = int(self.landmark[-1]) + 1 if len(self.landmark) else 0
         return np.searchsorted(self.landmark, np.arange(m + 1)).astype(np.int32)
+
+    def some(self, n: int) -> Rows:
+        """All sightings of n landmarks, or of as many as there are, evenly chosen among all."""
+        start = self.start
+        m = len(start) - 1
+        if m <= n:
+            return self
+        number = np.full(m, -1, np.int32)
+        number[np.linspace(0, m - 1, n).astype(int)] = np.arange(n)
+        of = number[self.landmark]
+        keep = of >= 0
+        return Rows(
+            self.frame[keep], self.camera[keep], of[keep], self.ray[keep], self.inv_depth[keep],
+            self.sigma_inv_depth[keep],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,12 +154,18 @@ def align(
     started = problem.linear()
     if isinstance(started, str):
         return started
-    if started[2] > MOST_BEHIND:
+    x, behind = started
+    if behind > MOST_BEHIND:
         return BEHIND
-    # A scene turned inside out, with the motion turned about, nearly fits as well: both ways are tried.
-    x = started[0]
+    # A scene turned inside out, with the motion turned about, nearly fits as well: both ways are tried, with some of
+    # the landmarks, and the better one is gone on with.
     turned = np.concatenate([x[:3], -x[3:6], x[6:]])
-    return _better(problem.refined(*started), problem.refined(turned, *problem.landmarks(turned)))
+    some = replace(problem, rows=rows.some(SOME))
+    first = _better(*(some.refined(some.guess(way)) for way in (x, turned)))
+    if isinstance(first, str):
+        return _better(*(problem.refined(problem.guess(way)) for way in (x, turned)))
+    x = np.concatenate([first.gravity, first.velocity, first.bias_accel - motions.bias_accel])
+    return problem.refined(replace(problem.guess(x), bias_gyro=first.bias_gyro))
 
 
 def _better(a: Alignment | str, b: Alignment | str) -> Alignment | str:
@@ -161,8 +183,8 @@ class _Problem:
     sigma_ray: float
     sigma_bias: tuple[float, float]
 
-    def linear(self) -> tuple[Array, Array, float] | str:
-        """x (9,) = gravity, velocity, accelerometer bias (from that of the motions); landmarks; the share behind."""
+    def linear(self) -> tuple[Array, float] | str:
+        """x (9,) = gravity, velocity, accelerometer bias (from that of the motions); share of landmarks behind."""
         m, rows, start = self.motions, self.rows, self.rows.start
         distance = np.ones(len(rows.frame))
         x, X, behind = np.zeros(9), np.zeros((len(start) - 1, 3)), 0.0
@@ -181,17 +203,17 @@ class _Problem:
                 m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam,
                 rows.frame, rows.camera, rows.ray, rows.inv_depth, along, start, x, distance, X,
             )  # fmt: skip
-        return x, X, behind
+        return x, behind
 
-    def landmarks(self, x: Array) -> tuple[Array, float]:
-        """Those that x (9,) makes of the sightings, and the share behind."""
+    def guess(self, x: Array) -> _Guess:
+        """By x (9,) = gravity, velocity, accelerometer bias (from that of the motions), and what landmarks it makes."""
         m, rows, start = self.motions, self.rows, self.rows.start
         X, along = np.zeros((len(start) - 1, 3)), self._along()
         behind = linear_landmarks(
             m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam, rows.frame, rows.camera, rows.ray, rows.inv_depth,
             along, start, x, np.ones(len(rows.frame)), X,
         )  # fmt: skip
-        return X, behind
+        return _Guess(x[:3], x[3:6], m.bias_gyro.copy(), m.bias_accel + x[6:], X, behind)
 
     def _along(self) -> Array:
         """(N,) weight of a measured depth along its ray, beside 1 across."""
@@ -200,9 +222,8 @@ class _Problem:
         along[measured] = (self.sigma_ray * rows.inv_depth[measured] ** 2 / rows.sigma_inv_depth[measured]) ** 2
         return along
 
-    def refined(self, x: Array, X: Array, behind: float) -> Alignment | str:
-        """Gauss-Newton (Levenberg-Marquardt) from the linear answer on, until it has settled."""
-        state = _Guess(x[:3], x[3:6], self.motions.bias_gyro.copy(), self.motions.bias_accel + x[6:], X)
+    def refined(self, state: _Guess) -> Alignment | str:
+        """Gauss-Newton (Levenberg-Marquardt) from there on, until it has settled."""
         best = self._equations(state, 1e-4)
         if best.used < 2 * N:
             return f"{best.used} rays agree with one motion, {2 * N} are needed"
@@ -222,7 +243,7 @@ class _Problem:
                 best = self._equations(state, damping)
         else:
             return f"images and IMU have not settled on one motion after {MOST_STEPS} steps"
-        return self._result(state, self._equations(state, 1e-10), behind)
+        return self._result(state, self._equations(state, 1e-10))
 
     def _equations(self, at: _Guess, damping: float) -> _Linearized:
         m, rows = self.motions, self.rows
@@ -254,7 +275,7 @@ class _Problem:
         gravity *= GRAVITY_M_S2 / np.linalg.norm(gravity)
         X = at.X.copy()
         step_landmarks(X, by.V_inverse, by.g, by.W, d)
-        return _Guess(gravity, at.velocity + d[2:5], at.bias_gyro + d[5:8], at.bias_accel + d[8:], X)
+        return _Guess(gravity, at.velocity + d[2:5], at.bias_gyro + d[5:8], at.bias_accel + d[8:], X, at.behind)
 
     def _poses(self, at: _Guess) -> tuple[Array, Array, Array]:
         """R (K, 3, 3), p, v (K, 3) of the body at the images."""
@@ -265,7 +286,7 @@ class _Problem:
         p = at.velocity * t + 0.5 * at.gravity * t * t + m.dp + d[:, 3:6]
         return R, p, at.velocity + at.gravity * t + m.dv + d[:, 6:]
 
-    def _result(self, at: _Guess, by: _Linearized, behind: float) -> Alignment | str:
+    def _result(self, at: _Guess, by: _Linearized) -> Alignment | str:
         try:
             covariance = np.asarray(np.linalg.inv(by.H), np.float64)
         except np.linalg.LinAlgError:
@@ -283,7 +304,7 @@ class _Problem:
             sigma_velocity=math.sqrt(max(np.linalg.eigvalsh(J_v @ covariance @ J_v.T)[-1], 0.0)),
             sigma_scale=math.sqrt(max(along @ J_p @ covariance @ J_p.T @ along, 0.0)) / max(path, 1e-9),
             sigma_tilt=math.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)),
-            path_m=path, rms=rms, inliers=by.inliers, n=len(self.rows.frame), behind=behind, chi2=by.cost,
+            path_m=path, rms=rms, inliers=by.inliers, n=len(self.rows.frame), behind=at.behind, chi2=by.cost,
         )  # fmt: skip
 
     def _sensitivity(self, k: int, tangent: Array) -> tuple[Array, Array]:
@@ -301,6 +322,7 @@ class _Guess:
     bias_gyro: Array
     bias_accel: Array
     X: Array
+    behind: float
 
 
 @dataclass(eq=False)
