@@ -24,6 +24,7 @@ from lodelight.doctor.turning import Alignment
 from lodelight.geometry.so3 import so3_exp
 from lodelight.imu.preintegration import preintegrate
 from lodelight.imu.samples import ImuSamples
+from lodelight.imu.vibration import with_least_noise
 from lodelight.messages import Imu
 from lodelight.rig import CameraSpec, ImuSpec
 from lodelight.types import Array
@@ -87,6 +88,7 @@ def lever_of(
         np.array([s.t_ns for s in imu], dtype=np.int64), np.array([s.gyro for s in imu]),
         np.array([s.accel for s in imu]),
     )  # fmt: skip
+    spec = with_least_noise(spec)
     margin_ns = abs(turning.offset_s) * 1e9 + 2e6
     inside = [m for m in moves if samples.t_ns[0] + margin_ns < m.t_a and m.t_b < samples.t_ns[-1] - margin_ns]
     rows = [_stretch(run, samples, spec, cam0, turning) for run in _in_a_row(inside)]
@@ -94,7 +96,7 @@ def lever_of(
         return None
     sigma = np.array([*MAYBE, *np.maximum(turning.sigma_turn_rad, LEAST_TURN_RAD), turning.sigma_offset_s])
     wander = np.repeat([spec.accel_walk, spec.gyro_walk], 3) * np.sqrt((moves[-1].t_b - moves[0].t_a) * 1e-9)
-    return _solved(rows, 1.0 / sigma**2, 1.0 / np.maximum(wander, 1e-6) ** 2, spec.accel_noise)
+    return _solved(rows, 1.0 / sigma**2, 1.0 / wander**2, spec.accel_noise)
 
 
 def _in_a_row(moves: Sequence[Move]) -> Iterator[list[Move]]:

@@ -23,11 +23,16 @@ MEMORY_S = 1.0
 LEAST = {"gyro_noise": 1.7e-5, "gyro_walk": 1.9e-6, "accel_noise": 2.0e-4, "accel_walk": 3.0e-4}
 
 
+def with_least_noise(spec: ImuSpec) -> ImuSpec:
+    """The specification with noise that no sensor is without."""
+    return replace(spec, **{name: max(least, getattr(spec, name)) for name, least in LEAST.items()})
+
+
 class Vibration:
     """Follows the noise of an IMU. spec : of one at rest; share : of white noise as strong as what the samples show."""
 
     def __init__(self, spec: ImuSpec, share: float) -> None:
-        self.spec = replace(spec, **{name: max(least, getattr(spec, name)) for name, least in LEAST.items()})
+        self.spec = with_least_noise(spec)
         self.share = share
         self._density2 = np.array([self.spec.gyro_noise, self.spec.accel_noise]) ** 2
 
