@@ -35,7 +35,8 @@ BLOCK_S = 1.0  # for which errors may be alike
 # How far off things may well be: lever m, accelerometer's bias m/s^2, scale, gyro's bias rad/s. Gravity and velocity
 # are not known at all; the turn and the offset are known as well as `Alignment` says.
 MAYBE = [*[0.3] * 3, *[0.3] * 3, 0.05, *[0.005] * 3]
-BIASES = [3, 4, 5, 7, 8, 9]
+COMMON = 14  # unknowns of all stretches, in the order of `_Stretch.A`
+BIASES = [3, 4, 5, 7, 8, 9]  # of them
 STEP = np.array([*[1e-4] * 3, *[1e-4] * 3, 1e-3])  # of gyro bias rad/s, turn rad and offset s, to differentiate by
 LEAST_TURN_RAD = 1e-3
 LEAST_M = 2e-5  # by which a move errs
@@ -75,6 +76,20 @@ class _Stretch:
     A: Array
     y: Array
     walk: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """Normal equations H (14, 14), b (14,) of what is common, with a stretch's own eliminated; gain (12, 15) gives that
+    back."""
+
+    H: Array
+    b: Array
+    gain: Array
+
+    def own(self, x: Array) -> Array:
+        out: Array = self.gain[:, COMMON] - self.gain[:, :COMMON] @ x
+        return out
 
 
 def lever_of(
@@ -145,18 +160,20 @@ def _solved(rows: list[_Stretch], prior: Array, prior_wander: Array, accel_noise
     """Least squares with weights that outliers do not pass; sure as leaving out a second at a time leaves it."""
     weights, noise = [np.ones(len(part.y)) for part in rows], (1e-3, accel_noise)
     for _ in range(ROUNDS):
-        x, own, H = _common(rows, prior, prior_wander, weights, noise)
-        left = [part.y - part.A @ np.concatenate([x, free]) for part, free in zip(rows, own, strict=True)]
+        reduced = [_reduced(part, weight, noise, prior_wander) for part, weight in zip(rows, weights, strict=True)]
+        x, H = _common(reduced, prior)
+        left = [part.y - part.A @ np.concatenate([x, of.own(x)]) for part, of in zip(rows, reduced, strict=True)]
         miss = [np.linalg.norm(r, axis=1) for r in left]
         spread = max(float(np.median(np.concatenate(miss))) / 1.54, 1e-5)  # median length of three normal coordinates
         weights = [1.0 / (1.0 + (m / (OUTLIER * spread)) ** 2) ** 2 for m in miss]
         noise = _likely(rows, left, weights, noise, accel_noise)
+    reduced = [_reduced(part, weight, noise, prior_wander) for part, weight in zip(rows, weights, strict=True)]
     left_out = []
     for i, part in enumerate(rows):
         block = (part.at_s - part.at_s[0]) // BLOCK_S
         for name in np.unique(block):
-            less = [w if j != i else np.where(block == name, 1e-9, w) for j, w in enumerate(weights)]
-            left_out.append(_common(rows, prior, prior_wander, less, noise)[0][:3] - x[:3])
+            less = _reduced(part, np.where(block == name, 1e-9, weights[i]), noise, prior_wander)
+            left_out.append(_common([*reduced[:i], less, *reduced[i + 1 :]], prior)[0][:3] - x[:3])
     d = np.array(left_out)
     values, axes = np.linalg.eigh(np.linalg.inv(H)[:3, :3])
     jackknife = (len(d) - 1) / len(d) * ((d @ axes) ** 2).sum(axis=0)
@@ -188,22 +205,19 @@ def _root(part: _Stretch, weight: Array, noise: tuple[float, float]) -> Array:
     return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
-def _common(
-    rows: list[_Stretch], prior: Array, prior_wander: Array, weights: list[Array], noise: tuple[float, float]
-) -> tuple[Array, list[Array], Array]:
-    """What is common to all (14,), each stretch's own (12,), and the information (14, 14) of the former."""
-    H: Array = np.diag(prior)
-    b, back = np.zeros(14), []
-    for part, weight in zip(rows, weights, strict=True):
-        L = _root(part, weight, noise)
-        J = np.linalg.solve(L, part.A.reshape(len(weight), -1)).reshape(-1, 26)
-        r = np.linalg.solve(L, part.y).ravel()
-        common, own = J[:, :14], J[:, 14:]
-        cross = own.T @ common
-        free = own.T @ own + np.diag([*[0.0] * 6, *prior_wander])
-        gain = np.linalg.solve(free, np.column_stack([cross, own.T @ r]))
-        H = H + common.T @ common - cross.T @ gain[:, :14]
-        b = b + common.T @ r - cross.T @ gain[:, 14]
-        back.append(gain)
-    x = np.asarray(np.linalg.solve(H, b), dtype=np.float64)
-    return x, [gain[:, 14] - gain[:, :14] @ x for gain in back], H
+def _reduced(part: _Stretch, weight: Array, noise: tuple[float, float], prior_wander: Array) -> _Reduced:
+    L = _root(part, weight, noise)
+    J = np.linalg.solve(L, part.A.reshape(len(weight), -1)).reshape(-1, part.A.shape[2])
+    r = np.linalg.solve(L, part.y).ravel()
+    common, own = J[:, :COMMON], J[:, COMMON:]
+    cross = own.T @ common
+    free = own.T @ own + np.diag([*[0.0] * 6, *prior_wander])
+    gain = np.linalg.solve(free, np.column_stack([cross, own.T @ r]))
+    H = common.T @ common - cross.T @ gain[:, :COMMON]
+    return _Reduced(H, common.T @ r - cross.T @ gain[:, COMMON], gain)
+
+
+def _common(parts: Sequence[_Reduced], prior: Array) -> tuple[Array, Array]:
+    """What is common to all (14,), and its information (14, 14)."""
+    H = np.diag(prior) + sum(part.H for part in parts)
+    return np.asarray(np.linalg.solve(H, sum(part.b for part in parts)), dtype=np.float64), H
