@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -187,35 +188,39 @@ class _Problem:
         """x (9,) = gravity, velocity, accelerometer bias (from that of the motions); share of landmarks behind."""
         m, rows, start = self.motions, self.rows, self.rows.start
         distance = np.ones(len(rows.frame))
-        x, X, behind = np.zeros(9), np.zeros((len(start) - 1, 3)), 0.0
-        along = self._along()
+        x, behind = np.zeros(9), 0.0
         for _ in range(LINEAR_REPETITIONS):
             H, b = linear_equations(
                 m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam,
-                rows.frame, rows.camera, rows.ray, rows.inv_depth, along, start, distance,
+                rows.frame, rows.camera, rows.ray, rows.inv_depth, self.along, start, distance,
             )  # fmt: skip
             H[6:, 6:] += np.eye(3) * 1e6  # no bias yet
             solved = _with_gravity(H, b)
             if solved is None:
                 return "the images show no motion that gravity could be told from"
             x = solved
-            behind = linear_landmarks(
-                m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam,
-                rows.frame, rows.camera, rows.ray, rows.inv_depth, along, start, x, distance, X,
-            )  # fmt: skip
+            _, behind = self._landmarks(x, distance)
         return x, behind
 
     def guess(self, x: Array) -> _Guess:
         """By x (9,) = gravity, velocity, accelerometer bias (from that of the motions), and what landmarks it makes."""
-        m, rows, start = self.motions, self.rows, self.rows.start
-        X, along = np.zeros((len(start) - 1, 3)), self._along()
-        behind = linear_landmarks(
-            m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam, rows.frame, rows.camera, rows.ray, rows.inv_depth,
-            along, start, x, np.ones(len(rows.frame)), X,
-        )  # fmt: skip
+        m = self.motions
+        X, behind = self._landmarks(x, np.ones(len(self.rows.frame)))
         return _Guess(x[:3], x[3:6], m.bias_gyro.copy(), m.bias_accel + x[6:], X, behind)
 
-    def _along(self) -> Array:
+    def _landmarks(self, x: Array, distance: Array) -> tuple[Array, float]:
+        """(M, 3) that x (9,) makes of the sightings, and the share behind; distance (N,) to them, is brought up to
+        date."""
+        m, rows, start = self.motions, self.rows, self.rows.start
+        X = np.empty((len(start) - 1, 3))
+        behind = linear_landmarks(
+            m.t_s, m.dR, m.dp, m.jacobian, self.R_cam, self.p_cam, rows.frame, rows.camera, rows.ray, rows.inv_depth,
+            self.along, start, x, distance, X,
+        )  # fmt: skip
+        return X, behind
+
+    @cached_property
+    def along(self) -> Array:
         """(N,) weight of a measured depth along its ray, beside 1 across."""
         rows, measured = self.rows, self.rows.inv_depth > 0
         along = np.zeros(len(rows.frame))
