@@ -8,6 +8,7 @@ the rotation along the body's axes (the chart of SE3.perturbed):
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ HEADER = (
 )
 
 
-def write_covariances(path: Path, t_ns: list[int], covariances: list[Array]) -> None:
+def write_covariances(path: Path, t_ns: list[int], covariances: Iterable[Array]) -> None:
     """Rows of t_ns and the 21 entries of each (6, 6), as exact as a double is."""
     rows = zip(t_ns, covariances, strict=True)
     lines = [f"{t}," + ",".join(repr(float(v)) for v in C[UPPER]) + "\n" for t, C in rows]
@@ -39,10 +40,15 @@ def read_covariances(path: Path) -> tuple[NDArray[np.int64], Array]:
     table = read_table(path, len(NAMES), ns_from_text)
     if table.bad:
         raise SourceError(f"{path} line {table.bad[0]}: expected t_ns and {len(NAMES)} numbers")
-    out = np.zeros((len(table.t_ns), 6, 6))
-    out[:, UPPER[0], UPPER[1]] = table.values[:, : len(NAMES)]
-    out[:, UPPER[1], UPPER[0]] = table.values[:, : len(NAMES)]
-    return table.t_ns, out
+    return table.t_ns, from_upper(table.values[:, : len(NAMES)])
+
+
+def from_upper(entries: Array) -> Array:
+    """(N, 6, 6) covariances by the entries (N, 21) of their UPPER triangles."""
+    out = np.zeros((len(entries), 6, 6))
+    out[:, UPPER[0], UPPER[1]] = entries
+    out[:, UPPER[1], UPPER[0]] = entries
+    return out
 
 
 def covariance_to_ros(R: Array, ours: Array) -> Array:

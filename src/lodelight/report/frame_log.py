@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lodelight.geometry.se3 import SE3
-from lodelight.io.covariances import UPPER
+from lodelight.io.covariances import UPPER, from_upper
 from lodelight.messages import Estimate
 from lodelight.trajectory import Trajectory
 from lodelight.types import AnyArray, Array, Bools
@@ -60,14 +60,9 @@ class FrameLog:
         poses = self.column("pose")[rows] if len(self) else np.zeros((0, 12))
         return Trajectory.from_poses(t_ns.tolist(), [SE3(p[:9].reshape(3, 3), p[9:]) for p in poses])
 
-    def covariances(self, rows: Bools) -> list[Array]:
-        """(6, 6) of these frames."""
-        out = []
-        for upper in self.column("covariance")[rows] if len(self) else []:
-            C = np.zeros((6, 6))
-            C[UPPER] = upper
-            out.append(C + np.triu(C, 1).T)
-        return out
+    def covariances(self, rows: Bools) -> Array:
+        """(M, 6, 6) of these frames."""
+        return from_upper(self.column("covariance")[rows] if len(self) else np.zeros((0, len(UPPER[0]))))
 
     def csv(self) -> str:
         """`frames.csv`."""
