@@ -36,6 +36,7 @@ from lodelight.imu.samples import ImuSamples
 from lodelight.io.listing import ImuTable
 from lodelight.io.sources import open_source
 from lodelight.io.trajectories import read_trajectory, write_tum
+from lodelight.memory import resident_bytes
 from lodelight.messages import Frame, Imu
 from lodelight.odometry.inertial import InertialOdometry, OdometryStep
 from lodelight.report.metrics import peak_rss_mb
@@ -221,18 +222,14 @@ def memory(folder: Path, minutes: float = 30.0, every_min: float = 2.0) -> None:
                     told += every_min
                     k = slam.map.keyframes
                     print(
-                        f"minute {told:4.0f}: {_resident_mb():4.0f} MB (most so far {peak_rss_mb():.0f}), "
+                        f"minute {told:4.0f}: {resident_bytes() / 2**20:4.0f} MB (most so far {peak_rss_mb():.0f}), "
                         f"{int(k.alive.sum())} of {len(k)} keyframes, {len(slam.map.alive_points)} points, "
                         f"{localized} of {frames} frames", flush=True,
                     )  # fmt: skip
             shift += lap_ns
     assert slam is not None
     slam.close()
-    print(f"all adjusted: {_resident_mb():.0f} MB (most {peak_rss_mb():.0f})")
-
-
-def _resident_mb() -> float:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    print(f"all adjusted: {resident_bytes() / 2**20:.0f} MB (most {peak_rss_mb():.0f})")
 
 
 if __name__ == "__main__":

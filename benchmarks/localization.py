@@ -34,6 +34,7 @@ from lodelight.io.trajectories import read_trajectory
 from lodelight.localizer import Localizer, LocalizerConfig
 from lodelight.mapping.map import Map
 from lodelight.mapping.store import load_map
+from lodelight.memory import resident_bytes
 from lodelight.messages import Estimate, Frame
 from lodelight.settings import with_settings
 from lodelight.slam import Slam, SlamConfig
@@ -344,8 +345,7 @@ def memory(given: argparse.Namespace) -> None:
     for i in range(given.minutes * per_minute + 1):
         localizer.feed(Frame(i * step_ns, there_and_back[i % len(there_and_back)].images))
         if i % per_minute == 0:
-            pages = int(Path("/proc/self/statm").read_text().split()[1])
-            print(f"minute {i // per_minute}: {pages * 4096 / 1e6:.1f} MB resident", flush=True)
+            print(f"minute {i // per_minute}: {resident_bytes() / 1e6:.1f} MB resident", flush=True)
 
 
 def loaded(given: argparse.Namespace) -> tuple[Map, SE3]:

@@ -10,19 +10,15 @@ import pytest
 
 CODE = """
 import numpy as np
-from pathlib import Path
-from lodelight.memory import give_back_large
-
-def resident():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+from lodelight.memory import give_back_large, resident_bytes
 
 np.ones(30 << 20, np.uint8)  # from then on malloc would keep the room of arrays up to that size
 give_back_large()
 pairs = [(np.ones(4 << 20, np.uint8), np.ones(64 << 10, np.uint8)) for _ in range(40)]
-most = resident()
+most = resident_bytes()
 small = [pair[1] for pair in pairs]
 del pairs
-print(most - resident())
+print(most - resident_bytes())
 """
 
 
