@@ -161,7 +161,7 @@ class KltTracker:
         Raises SourceError where an image is not of the rig's size.
         """
         _check_size(frame.images[0], self.spec)
-        image = self._equalized(frame.images[0])
+        image = self._evened(frame.images[0])
         if self._last is None or self._tracks is None or len(self._tracks) == 0:
             tracks, drift = Tracks.none(frame.t_ns), np.zeros((0, 2), np.float32)
             self.flow = Flow(np.eye(3))
@@ -198,7 +198,7 @@ class KltTracker:
         share = min(self.flow.moved_px / (LENS_REACH_RAD * self.camera.focal_px), 1.0)
         return 2.0 * self._lens_px**2 * share * max(followed / LENS_PATCHES, 1.0)
 
-    def _equalized(self, image: Bytes) -> Bytes:
+    def _evened(self, image: Bytes) -> Bytes:
         """Its difference from the mean around, over the deviation around.
 
         The lens darkens an image towards its rim, and that does not move with what is seen: a patch of slope g of its
@@ -300,7 +300,7 @@ class KltTracker:
         """Tracks with their pixels in camera 1, and the inverse depth both cameras give."""
         assert self.right is not None
         _check_size(right, self.right)
-        right, expected = self._equalized(right), self._expected_inv_depth(tracks)
+        right, expected = self._evened(right), self._expected_inv_depth(tracks)
         measured = self._in_right(left, right, tracks, expected)
         if not expected.any() and measured.stereo.any():  # the first: what is as far as most is found from there
             usual = np.median(measured.inv_depth[measured.stereo])
